@@ -15,6 +15,7 @@ from p2gs_jax.core.atomic import write_json
 from p2gs_jax.photometry.ppisp_start import start_of
 from p2gs_jax.run.foreign import common_look
 from p2gs_jax.run.photometry_files import PhotometryFile, read_photometry
+from p2gs_jax.run.scene_file import folder_of, relative_path
 from p2gs_jax.types import GAMMA_SRGB, View
 
 
@@ -27,8 +28,8 @@ def write_for(
     on each file, or the reason why it is not written: the program cannot express this photometry.
     """
     saved = read_photometry(folder / "photometry.json")
-    base = scene.parent if scene.suffix.lower() == ".json" else scene
-    writers = {"ppisp": _ppisp, "3dgs": _3dgs, "nerfstudio": partial(_nerfstudio, base=base)}
+    nerfstudio = partial(_nerfstudio, base=folder_of(scene))
+    writers = {"ppisp": _ppisp, "3dgs": _3dgs, "nerfstudio": nerfstudio}
     return [writers[name](folder, saved, views) for name in dict.fromkeys(trainers)]
 
 
@@ -85,19 +86,12 @@ def _3dgs(folder: Path, saved: PhotometryFile, views: Sequence[View]) -> str:
 
 
 def _nerfstudio(folder: Path, saved: PhotometryFile, views: Sequence[View], *, base: Path) -> str:
-    """Write the photometry of every photograph as fields of a frame of `transforms.json`.
-
-    A `file_path` is relative to `base`, or the name of a view whose photograph lies elsewhere.
-    """
+    """Write the photometry of every photograph as fields of a frame of `transforms.json`."""
     path, fields = folder / "frames.json", ("exposure_ev", "gamma", "white_balance")
     rows = {row["image"]: row for row in saved["views"]}
-
-    def file_path(view: View) -> str:
-        path, root = view.image_path.resolve(), base.resolve()
-        return path.relative_to(root).as_posix() if path.is_relative_to(root) else view.name
-
     frames = [
-        {"file_path": file_path(view), **{name: rows[view.name][name] for name in fields}}
+        {"file_path": relative_path(view.image_path, base)}
+        | {name: rows[view.name][name] for name in fields}
         for view in views
     ]
     write_json(path, {"frames": frames})

@@ -34,7 +34,7 @@ _OF_OBJECTS = ("name", "label", "size", "moving")
 
 def write_scene(folder: Path, scene: Scene) -> None:
     """Write the scene of a run into its folder."""
-    base = _base(scene.root)
+    base = folder_of(scene.root)
     ego_masks = {v.camera: v.ego_mask for v in scene.views if v.ego_mask is not None}
     table = {
         **{name: getattr(scene, name) for name in _OF_SCENES},
@@ -71,9 +71,9 @@ def _view_row(view: View, folder: Path, base: Path) -> dict[str, Any]:
     lens = view.distortion
     return {
         **{name: getattr(view, name) for name in _OF_VIEWS},
-        "image": _relative(view.image_path, folder if in_run else base),
+        "image": relative_path(view.image_path, folder if in_run else base),
         "in_run": in_run,
-        "mask": None if view.mask_path is None else _relative(view.mask_path, base),
+        "mask": None if view.mask_path is None else relative_path(view.mask_path, base),
         "distortion": None if lens is None else lens.coefficients,
         "lens": None if lens is None else lens.model,
     }
@@ -96,7 +96,7 @@ def read_scene(folder: Path, root: Path) -> Scene:
 
 
 def _scene_from(a: Mapping[str, np.ndarray], table: dict, folder: Path, root: Path) -> Scene:
-    base = _base(root)
+    base = folder_of(root)
     ego_masks = {camera: a[f"ego_mask_{k}"] for k, camera in enumerate(table["ego_masks"])}
     views = tuple(
         View(
@@ -151,12 +151,12 @@ def read_times(folder: Path) -> dict[str, float]:
         return {}
 
 
-def _base(root: Path) -> Path:
+def folder_of(root: Path) -> Path:
     """Return the folder to which paths of photographs are relative; `root` may be a JSON file."""
     return root.parent if root.suffix.lower() == ".json" else root
 
 
-def _relative(path: Path, base: Path) -> str:
+def relative_path(path: Path, base: Path) -> str:
     """Return the path relative to `base` if it lies below it, or else an absolute path."""
     for a, b in ((os.path.abspath(path), os.path.abspath(base)), (path.resolve(), base.resolve())):
         if Path(a).is_relative_to(b):

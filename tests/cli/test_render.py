@@ -134,6 +134,8 @@ def test_a_folder_in_place_of_a_video_is_kept(refused, finished_run, tmp_path):
         ({"split": "test", "panorama": True}, ("cam/0.png",), "test_panorama"),
         ({"panorama": True}, ("cam/0.png",), "panorama"),
         ({"trajectory": "drive", "shift": -2.0}, ("cam/0.png",), "drive_2_right"),
+        ({"without_objects": True}, ("cam/0.png",), "all_without_objects"),
+        ({"trajectory": "drive", "only_objects": True}, ("cam/0.png",), "drive_only_objects"),
         # The folder of that name holds photographs.
         ({"split": "test"}, ("test/r_0.png",), "test_views"),
         ({"trajectory": "drive"}, ("drive/0.png",), "drive_views"),

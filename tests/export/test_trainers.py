@@ -58,8 +58,12 @@ def test_values_of_ppisp_have_its_names_and_shapes(tmp_path):
     np.testing.assert_allclose(np.diff(saved["exposure_params"]), np.log2(3.0 / 0.5), atol=1e-5)
 
 
-def test_frames_of_nerfstudio_have_their_exposures(tmp_path):
+def test_frames_of_nerfstudio_have_their_exposures(tmp_path, monkeypatch):
     photometry(tmp_path / "photometry.json", "srgb")
+    monkeypatch.chdir(tmp_path)
+    for folder in ("elsewhere", "scene"):
+        Path(folder).mkdir()
+    Path("scene/images").symlink_to(tmp_path / "elsewhere")
     assert "frames.json" in write_for(["nerfstudio"], tmp_path, VIEWS, Path("scene"))[0]
     first, _ = json.loads((tmp_path / "frames.json").read_text())["frames"]
     assert first["file_path"] == "images/a.png"

@@ -177,7 +177,7 @@ def point_colors(
         found = sample_patches(ldr, mask, grids, len(mine), deviation)
         unclipped[row], bordered[row] = unclipped_from(ldr, mask), has_black_border(ldr, mask)
         if views[row].mask_path is not None:
-            kept_by_mask[row] = mask.mean()
+            kept_by_mask[row] = np.mean(mask > 0)  # exact, however many pixels
         good = found.valid
         at = places(centres[good], *mask.shape[::-1]).astype(np.float32)
         wide = -np.log2(scales[row][keep[row]][good]).astype(np.float32)

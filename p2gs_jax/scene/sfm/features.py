@@ -107,8 +107,8 @@ def extract(
             why = f"COLMAP could not extract features in {image_folder}: {error}."
             fix = "find an image there that does not open, and remove or replace it"
             raise UserError(why, fix=fix) from error
-        if mode == pycolmap.CameraMode.SINGLE:
-            camera = _cameras(database).get(part[0], camera)
+        if camera is None and mode == pycolmap.CameraMode.SINGLE:
+            camera = _cameras(database).get(part[0])
 
 
 def _halvings(path: Path) -> int:
