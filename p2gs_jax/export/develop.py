@@ -44,7 +44,7 @@ from p2gs_jax.types import Photometry, Scene, View
 Depth = Literal["8bit", "16bit", "exr"]
 FOLDER = "developed"
 # Part of the key of developed photographs: raise it whenever results change.
-_VERSION = 1
+_VERSION = 2
 # Suffixes that photographs keep, the suffix of all others, and the stored value of white: values of
 # 8 bits have 8 fractional bits.
 _FORMATS: dict[Depth, tuple[tuple[str, ...], str, int]] = {
@@ -110,7 +110,8 @@ class _Lab:
         self.mean = mean_parameters(self.photometry)
 
     def film(self, row: int, top: int) -> Film:
-        return Film.of(self.photometry.capture(row), top, self.cfg, self.loss.saturation)
+        capture = self.photometry.capture(row)
+        return Film.of(self.views[row], capture, top, self.cfg, self.loss.saturation)
 
     def read(self, row: int) -> tuple[np.ndarray, np.ndarray, np.ndarray | None, Film]:
         """Return stored values, the pixels that count, alpha, and the film of a photograph."""
@@ -303,7 +304,8 @@ def _key(lab: _Lab, log_exposure: float, options: Development, places: Mapping[s
     p = lab.photometry
     parameters = [p.raw_exposures, p.raw_gammas, p.raw_white_balance]
     settings = [asdict(lab.cfg), asdict(lab.loss), asdict(options), dict(places)]
-    whole = [_VERSION, file_fingerprints(paths), log_exposure, parameters, settings]
+    lenses = [(view.K, None if (d := view.distortion) is None else asdict(d)) for view in lab.views]
+    whole = [_VERSION, file_fingerprints(paths), log_exposure, parameters, settings, lenses]
     # The last digits of a solution may differ between processors.
     text = json.dumps(plain(whole))
     rounded = json.loads(text, parse_float=lambda number: round(float(number), 5) + 0.0)

@@ -20,12 +20,15 @@ from jaxtyping import Float32, UInt, UInt8, UInt16
 from p2gs_jax.config import PhotometryConfig
 from p2gs_jax.photometry import formation
 from p2gs_jax.photometry.response import DARKEST, by_camera
-from p2gs_jax.types import GAMMA_SRGB, Capture
+from p2gs_jax.scene.lens import undistort_points
+from p2gs_jax.types import GAMMA_SRGB, Capture, View
 
 # Steps of the common curve in log radiance: each is at most 0.4 of a 16-bit code at gamma 2.2.
 _STEPS = 2**20
 # Entries of the table of vignetting over r^2, and rows of pixels that are converted at a time.
 _RADII, _ROWS = 2**16, 64
+# Intervals of the grid, along each side of a photograph, that is undistorted for r^2.
+_INTERVALS = 128
 
 Pixels = UInt[np.ndarray, "h w 3"]
 Logs = Float32[np.ndarray, "*n 3"]
@@ -59,12 +62,15 @@ def common_curve(log_exposure: float, gamma: float, cfg: PhotometryConfig, most:
 class Film:
     """The inverse curve of one photograph, from stored values to log radiance."""
 
+    view: View
     logs: Float32[np.ndarray, "levels 3"]  # log radiance of every stored value, without vignetting
     shade: Float32[np.ndarray, "r k"] | None  # log V over r^2, k = 1 or 3 channels
     white: int  # smallest stored value that counts as clipped
 
     @classmethod
-    def of(cls, capture: Capture, top: int, cfg: PhotometryConfig, saturation: float) -> Film:
+    def of(
+        cls, view: View, capture: Capture, top: int, cfg: PhotometryConfig, saturation: float
+    ) -> Film:
         """Return the curve of values 0 to `top`; display values >= `saturation` are clipped."""
         values = np.repeat((np.arange(1, top + 1) / top)[:, None], 3, 1)
         logs = np.log(formation.inverse_formation(values, capture, cfg, np.zeros((top, 2))))
@@ -77,7 +83,7 @@ class Film:
             shade = formation.log_vignetting(squared, capture.camera, cfg)
         shaded = shade is not None and shade.any()
         white = int(np.ceil(saturation * top - 1e-6))
-        return cls(logs.astype(np.float32), shade if shaded else None, white)
+        return cls(view, logs.astype(np.float32), shade if shaded else None, white)
 
     def most(self) -> float:
         """Return the largest log radiance of an unclipped value at any place of the photograph."""
@@ -101,7 +107,7 @@ class Film:
         tinted = np.ptp(self.logs[-1]) > 1e-3 or (
             self.shade is not None and self.shade.shape[1] > 1
         )
-        squared = None if self.shade is None else formation.squared_radii(*pixels.shape[:2])
+        squared = None if self.shade is None else squared_radii(self.view, *pixels.shape[:2])
         for rows, block in _blocks(pixels):
             if self.shade is None or squared is None:
                 found = _looked_up(block, table)
@@ -113,6 +119,31 @@ class Film:
                 found[clipped] = found[clipped].max(1, keepdims=True)
             out[rows] = found
         return out
+
+
+def squared_radii(view: View, height: int, width: int) -> Float32[np.ndarray, "h w"]:
+    """Return r^2 of the pixels of a photograph of any size: that of their undistorted positions.
+
+    Vignetting is solved and rendered in undistorted images. Outside of these it continues with its
+    value in their corners.
+    """
+    if view.distortion is None:
+        return formation.squared_radii(height, width)
+    x, y = (np.linspace(0, side, _INTERVALS + 1) for side in (view.width, view.height))
+    nodes = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
+    straight = undistort_points(nodes, view.K, view.distortion)
+    squared = (formation.places(straight, view.width, view.height) ** 2).sum(-1)
+    known = np.where(np.isfinite(squared), np.minimum(squared, 1), 1).astype(np.float32)
+    rows = _interpolated(known.reshape(_INTERVALS + 1, -1), height)
+    return _interpolated(rows.T, width).T
+
+
+def _interpolated(nodes: Float32[np.ndarray, "n k"], size: int) -> Float32[np.ndarray, "s k"]:
+    """Return values at the centres of `size` pixels from values at the ends of equal intervals."""
+    position = (np.arange(size) + 0.5) * ((len(nodes) - 1) / size)
+    low = position.astype(int)
+    share = (position - low).astype(np.float32)[:, None]
+    return nodes[low] * (1 - share) + nodes[low + 1] * share
 
 
 def dithered(codes: UInt16[np.ndarray, "h w 3"], name: str) -> UInt8[np.ndarray, "h w 3"]:

@@ -13,6 +13,7 @@ from p2gs_jax.formats.frames import data_url, shrunk
 from p2gs_jax.photometry.display import DisplayTransform
 from p2gs_jax.photometry.response import by_camera, tables
 from p2gs_jax.run.read import Run
+from p2gs_jax.scene.rigid import up_direction
 
 # Middles of the steps of false colour, stops from mid-grey (formats/false_color.py).
 STEPS = np.arange(-6, 6) + 0.5
@@ -48,7 +49,7 @@ def page_scene(
         "tone": _tone(fitted),
         "views": [_view(fitted, index, mean) for index in range(len(fitted.scene.views))],
         "start": _start(fitted),
-        "up": _up(fitted),
+        "up": up_direction(np.stack([view.viewmat for view in fitted.scene.views])).tolist(),
         "stopColors": false_color(np.exp2(STEPS)[None, :, None] * np.ones(3), 1.0)[0],
         "photographs": {str(index): url for index, url in photographs.items()},
     }
@@ -103,13 +104,6 @@ def _start(fitted: Run) -> int:
     views, train = fitted.scene.views, fitted.scene.train_indices
     rows = [row for row in train if views[row].camera == views[train[0]].camera]
     return rows[len(rows) // 2]
-
-
-def _up(fitted: Run) -> list[float]:
-    """Return the mean up direction of the cameras, a unit vector in the world."""
-    up = -np.mean([view.viewmat[1, :3] for view in fitted.scene.views], 0, dtype=float)
-    length = np.linalg.norm(up)
-    return [float(v) for v in (up / length if length > 1e-6 else (0.0, -1.0, 0.0))]
 
 
 def rounded(value: Any) -> Any:

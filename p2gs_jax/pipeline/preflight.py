@@ -87,13 +87,13 @@ def check_scene(
     """Check that options suit the scene, before exposures are solved; nothing is written.
 
     The result is the photographs under one common exposure, if there are any. UserError: the
-    options do not suit the views, or the run began with other photographs.
+    options do not suit the views, or the run began with other photographs or cameras.
     """
     training, begun = scene.training_views, RunFolder(paths.run).config
-    now = recognition_key(scene.views)
+    now = recognition_key(scene.views, cfg.photometry.known)
     if begun.exists() and read_config(begun)[0].get("photographs") != now:
-        why = f"{paths.run} was begun with other photographs than {paths.scene} holds now: names "
-        why += "or file sizes differ."
+        why = f"{paths.run} was begun with other photographs, cameras, held-out views or known "
+        why += f"exposures than {paths.scene} and the options name now."
         fix = "restore them as they were, or name another folder with --out"
         raise UserError(why, fix=fix)
     if lpips_weights is not None:

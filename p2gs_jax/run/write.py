@@ -59,7 +59,7 @@ def write_start(
             "begun": begun,
             **remembered("scene", scene, folder.root),
             **remembered("reference", reference, folder.root),
-            "photographs": recognition_key(views),
+            "photographs": recognition_key(views, cfg.photometry.known),
             "fit": config_to_dict(cfg),
         },
     )

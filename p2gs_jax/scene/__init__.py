@@ -17,7 +17,7 @@ from p2gs_jax.scene.convert.readers import exif_evs
 from p2gs_jax.scene.drives import read_drive
 from p2gs_jax.scene.drives.assemble import assemble
 from p2gs_jax.scene.drives.recording import Recording
-from p2gs_jax.scene.files import Report, is_panorama, list_images
+from p2gs_jax.scene.files import Report, is_panorama, list_images, map_notes
 from p2gs_jax.scene.hdr_sets import exposure_times, with_all_exposures, with_raw_settings
 from p2gs_jax.scene.masks import attach_masks, image_folder_of, with_alpha
 from p2gs_jax.scene.pixels.store import ImageStore, camera_at, size_at
@@ -58,11 +58,13 @@ def load_scene(
         else:
             if work_dir is not None:
                 check_apart(work_dir.parent, found, _searches_below(found.folder, root, cfg))
-            photographs = convert_photographs(*found, work_dir, report)
+            photographs = convert_photographs(found.folder, found.paths, work_dir, report)
         folder, paths = photographs.folder, photographs.paths
         auto = "sequence" if isinstance(found, Path) else "auto"
         scene = load_images(Path(root), folder, paths, cfg, work_dir, report, auto)
         scene = with_originals(scene, photographs)
+        if isinstance(found, PhotographsAlone):
+            scene = dataclasses.replace(scene, notes=(*scene.notes, *found.notes))
     else:
         scene = found
     listed = scene.split_by is not None or cfg.split is not None
@@ -109,6 +111,7 @@ class PhotographsAlone(NamedTuple):
 
     folder: Path
     paths: list[Path]
+    notes: tuple[str, ...] = ()
 
 
 def find_scene(
@@ -194,12 +197,13 @@ def _read_colmap(root: Path, folder: Path, cfg: DataConfig) -> Scene:
 def _photographs_alone(root: Path, cfg: DataConfig) -> PhotographsAlone:
     folders = [root / cfg.images] if cfg.images is not None else [root / "images", root]
     for folder in folders:
-        paths = list_images(folder, recursive=_searches_below(folder, root, cfg))
+        below = _searches_below(folder, root, cfg)
+        paths = list_images(folder, recursive=below)
         for path in paths:
             if is_panorama(path):
                 raise broken(path, "shows a whole sphere, and is not a pinhole photograph", CUT)
         if paths:
-            return PhotographsAlone(folder, paths)
+            return PhotographsAlone(folder, paths, tuple(map_notes(folder)) if below else ())
     looked = ", ".join(str(folder) for folder in folders)
     fix = "name the folder that holds one of these"
     film = next((p for p in sorted(root.iterdir()) if p.suffix.lower() in VIDEO_SUFFIXES), None)

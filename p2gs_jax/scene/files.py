@@ -36,8 +36,8 @@ IMAGE_SUFFIXES = CONVERTED_SUFFIXES | {".jpg", ".jpeg", ".jfif", ".jp2", ".png",
 IMAGE_SUFFIXES |= {".bmp", ".pgm", ".ppm"}
 # Folders of masks. Masks beside photographs are recognised by names: `a_mask`, `a.mask`, `mask_a`.
 MASK_FOLDERS = ("masks", "mask", "dynamic_masks", "dynamic_mask")
-# Folders of pictures that are not photographs.
-OTHER_FOLDERS = {*MASK_FOLDERS, "depth", "depths", "normal", "normals"}
+# Folders of pictures that are neither masks nor photographs.
+MAP_FOLDERS = ("depth", "depths", "normal", "normals")
 _MASK_NAME = re.compile(r"^(dynamic_)?masks?[._-](?=.)|(?<=.)[._-](dynamic_)?masks?$")
 _TWO_SUFFIXES = re.compile(r"\.(jpe?g|png)\.png$", re.IGNORECASE)
 # Largest distance of a principal point from the image centre, as a fraction of the sides.
@@ -63,17 +63,37 @@ def list_images(folder: Path, *, recursive: bool = True) -> list[Path]:
     Hidden files are left out, and so are masks (in a folder of masks, or named after a photograph),
     depth maps and normal maps. Raises OSError: a folder cannot be read.
     """
+    outside = [p for p in _pictures(folder, recursive) if not _is_in(p, MASK_FOLDERS + MAP_FOLDERS)]
+    named = {p for p in outside if named_as_mask(p.name)}
+    photos = {name_without_mask(p.as_posix()) for p in outside if p not in named}
+    masks = {p for p in named if name_without_mask(p.as_posix()) in photos or _always_mask(p.name)}
+    return [folder / p for p in sorted({*outside} - masks, key=lambda p: p.as_posix())]
+
+
+def map_notes(folder: Path) -> list[str]:
+    """Return a note if pictures below a folder are left out as depth maps or normal maps.
+
+    Brackets may have such names: `dark`, `normal` and `bright`.
+    """
+    found = [p for p in _pictures(folder, True) if _is_in(p, MAP_FOLDERS)]
+    names = first_few([path.as_posix() for path in found])
+    note = f"{len(found)} of the pictures count as depth maps or normal maps by the names of their "
+    note += f"folders: {names}. If they are photographs, rename the folders."
+    return [note] if found else []
+
+
+def _pictures(folder: Path, recursive: bool) -> list[Path]:
+    """Return the paths of visible pictures relative to a folder; none if it does not exist."""
     if not folder.is_dir():
         return []
     files = files_below(folder) if recursive else folder.iterdir()
     found = (p for p in files if p.suffix.lower() in IMAGE_SUFFIXES and p.is_file())
     relative = (p.relative_to(folder) for p in found)
-    visible = [p for p in relative if not any(part.startswith(".") for part in p.parts)]
-    outside = [p for p in visible if OTHER_FOLDERS.isdisjoint(map(str.lower, p.parts[:-1]))]
-    named = {p for p in outside if named_as_mask(p.name)}
-    photos = {name_without_mask(p.as_posix()) for p in outside if p not in named}
-    masks = {p for p in named if name_without_mask(p.as_posix()) in photos or _always_mask(p.name)}
-    return [folder / p for p in sorted({*outside} - masks, key=lambda p: p.as_posix())]
+    return [p for p in relative if not any(part.startswith(".") for part in p.parts)]
+
+
+def _is_in(path: Path, names: Sequence[str]) -> bool:
+    return not {part.lower() for part in path.parts[:-1]}.isdisjoint(names)
 
 
 def files_below(folder: Path, above: tuple[Path, ...] = ()) -> Iterator[Path]:
@@ -368,14 +388,22 @@ def file_fingerprints(paths: Sequence[Path]) -> list[tuple[str, int, int]]:
     return [(str(path.resolve()), stat.st_size, stat.st_mtime_ns) for path, stat in stats]
 
 
-def recognition_key(views: Iterable[View]) -> str:
-    """Return a hash of the names and file sizes of photographs and masks; copies have the same."""
-    files = [(view.name, view.image_path, view.mask_path) for view in views]
-    sizes = [
-        (name, *(p.stat().st_size if p and p.exists() else None for p in paths))
-        for name, *paths in files
-    ]
-    return hashlib.sha256(repr(sizes).encode()).hexdigest()[:16]
+def recognition_key(views: Iterable[View], known: str | None) -> str:
+    """Return a hash of what a fit may not change on the way; copies of the files have the same.
+
+    It covers names and file sizes of photographs and masks, the split, the cameras and the file of
+    known exposures, if `known` names one.
+    """
+
+    def facts(view: View) -> list[Any]:
+        paths = view.image_path, view.mask_path
+        sizes = [p.stat().st_size if p and p.exists() else None for p in paths]
+        # Another processor may round the last digits otherwise.
+        camera = [(np.round(m, 4) + 0.0).tolist() for m in (view.viewmat, view.K)]
+        return [view.name, sizes, view.split, camera, view.distortion]
+
+    table = Path(known).read_bytes() if known and Path(known).is_file() else None
+    return hashlib.sha256(repr([*map(facts, views), table]).encode()).hexdigest()[:16]
 
 
 def stage_progress(report: Report, stage: str, total: int, unit: str) -> Callable[[int], None]:

@@ -195,14 +195,17 @@ def up_direction(viewmats: Float[np.ndarray, "n 4 4"]) -> Vector3:
     """Return the up direction from world-to-camera matrices of level cameras.
 
     It is the normal of the plane that their right-hand axes span, whatever their pitch. If all
-    cameras look in one direction, it is the mean of their up axes.
+    cameras look in one direction, it is the mean of their up axes. Photographs in portrait format
+    may be stored on their side: if up axes cancel and right-hand axes do not, these are vertical.
+    Cameras then look down rather than up; if neither, right is down, as on most telephones.
     """
-    mean = -np.mean(viewmats[:, 1, :3], axis=0)
+    right, down, ahead = np.mean(viewmats[:, :3, :3], axis=0)
     _, sizes, axes = np.linalg.svd(viewmats[:, 0, :3], full_matrices=True)
     sizes = np.append(sizes, np.zeros(3))[:3] / np.sqrt(len(viewmats))
-    normal = axes[2] * np.sign(axes[2] @ mean)
+    normal = -axes[2] * np.sign(axes[2] @ down)
     if sizes[1] < SPANNING_RMS or sizes[2] > 0.5 * sizes[1] or not normal.any():
-        normal = mean
+        on_side = np.linalg.norm(right) > max(0.5, 2 * np.linalg.norm(down))
+        normal = -right * (np.sign(ahead @ right) or 1.0) if on_side else -down
     return normal / max(np.linalg.norm(normal), 1e-12)
 
 

@@ -63,7 +63,8 @@ def survey(root: Path, cfg: DataConfig, report: Report = lambda message: None) -
     alone = ("There are no cameras: structure from motion finds them when a fit starts.",)
     if isinstance(found, PhotographsAlone):
         names = [path.relative_to(found.folder).as_posix() for path in found.paths]
-        return Survey("images", _sizes(found), (*bracket_notes(names_of_brackets(names)), *alone))
+        notes = (*bracket_notes(names_of_brackets(names)), *found.notes, *alone)
+        return Survey("images", _sizes(found), notes)
     if isinstance(found, Path):  # a video
         camera = SurveyedCamera("", expected_frames(found) or 0, video_size(found))
         return Survey("video", (camera,), alone)

@@ -155,6 +155,33 @@ def test_photographs_become_those_of_the_common_exposure(varied, depth):
         assert (np.unique(found).size > 256) == (depth == "16bit")
 
 
+@pytest.mark.parametrize("k1", [-0.2, 0.1])
+def test_vignetting_follows_the_lens(tmp_path, k1):
+    """It is solved in undistorted images, while photographs are developed as they are."""
+    selection = selection_of(**{**PLAIN, "shade": ((-0.4, -0.2, 0.0),)})
+    cfg = decide(CFG, selection, None).resolve(CFG).photometry
+    y, x = (np.mgrid[:100, :112] + 0.5 - [[[50]], [[56]]]) / 90
+    straight = np.linspace(0, 1.2, 4000)
+    ray = np.interp(np.hypot(x, y), straight * (1 + k1 * straight**2), straight)
+    places = np.stack([x, y], -1) * (ray / np.hypot(x, y) * 90 / np.hypot(56, 50))[..., None]
+    grey, capture = (
+        np.full((100, 112, 3), 0.3, np.float32),
+        on_host(Capture, np.float32(1), np.float32(2.2), None, np.int32(0)),
+    )
+
+    def write(path, _):
+        shown = formation(grey, capture, cfg, positions=places.astype(np.float32))
+        Image.fromarray(np.rint(255 * shown).astype(np.uint8)).save(path)
+
+    root = rewrite(make_scene(tmp_path), ".png", write)
+    listed = root / "sparse" / "0" / "cameras.txt"
+    listed.write_text(f"1 SIMPLE_RADIAL 112 100 90 56 50 {k1}\n")
+    _, out = run(root, selection, depth="exr")
+    light = read_exr(out / "images" / "0.exr")[0][..., 1]
+    inside = np.linalg.norm(places, axis=-1) < 1
+    assert np.abs(np.log2(light / 0.3))[inside].max() < 0.02
+
+
 def test_masks_hide_pixels_that_the_originals_lost(varied):
     root, selection = varied
     _, out = run(root, selection)

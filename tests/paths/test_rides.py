@@ -105,6 +105,16 @@ def test_cameras_all_around_give_a_level_circle_around_their_focus():
         assert inverse(s.viewmat)[1, 3] == pytest.approx(FOCUS[1] - 5 * np.sin(np.deg2rad(30)))
 
 
+@pytest.mark.parametrize("turn", [-1, 1])
+def test_photographs_stored_on_their_side_give_the_same_circle(turn):
+    """Telephones store photographs in portrait format so, turned to either side."""
+    roll = np.array([[0.0, -turn, 0, 0], [turn, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+    cameras = [shot(roll @ s.viewmat) for s in around(np.arange(0, 360, 30))]
+    circle = find_orbit(cameras, cameras, NO_POINTS)
+    heights = [inverse(s.viewmat)[1, 3] for s in orbit(circle, cameras, 36)]
+    np.testing.assert_allclose(heights, FOCUS[1] - 5 * np.sin(np.deg2rad(30)))
+
+
 def test_cameras_on_one_side_give_an_arc_over_their_azimuths():
     cameras = around(np.arange(150, 251, 10))
     circle = find_orbit(cameras, cameras, NO_POINTS)

@@ -78,14 +78,22 @@ def test_functions_refuse_what_commands_refuse(tmp_path, scene, command, field, 
     assert words in str(refused.value)
 
 
-def test_a_run_is_not_continued_with_other_photographs(finished_run, tmp_path, refused):
+@pytest.mark.parametrize("change", ["photograph", "split", "camera"])
+def test_a_run_is_not_continued_with_other_inputs(finished_run, tmp_path, refused, change):
+    """Exposures that are kept by row would belong to other photographs."""
     run, scene = tmp_path / "run", tmp_path / "scene"
     shutil.copytree(finished_run, run)
     shutil.copytree(finished_run.parent / "scene", scene)
     saved = json.loads((run / "config.json").read_text()) | {"scene": str(scene)}
     (run / "config.json").write_text(json.dumps(saved))
     first, second = sorted((scene / "images").iterdir())[:2]
-    shutil.copy(second, first)
+    if change == "photograph":
+        shutil.copy(second, first)
+    elif change == "split":
+        (scene / "test.txt").write_text(first.name + "\n")
+    else:
+        model = scene / "sparse" / "0" / "cameras.txt"
+        model.write_text(model.read_text().replace("90.0", "91.0"))
     files = {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
     text = refused("fit", scene, "--out", run, *FIT, "--steps", "70", "--resume")
     assert "begun with other photographs" in text

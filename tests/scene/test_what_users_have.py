@@ -16,10 +16,11 @@ from p2gs_jax.config import DataConfig
 from p2gs_jax.export.folders import write_folder
 from p2gs_jax.paths.files import near_scene
 from p2gs_jax.paths.shots import Shot
-from p2gs_jax.scene import ImageStore, find_scene
+from p2gs_jax.scene import ImageStore, PhotographsAlone, find_scene
 from p2gs_jax.scene.cameras import name_cameras
 from p2gs_jax.scene.files import find_names, is_panorama, same_aspect
 from p2gs_jax.scene.rigid import require_axes
+from p2gs_jax.scene.survey import survey
 from p2gs_jax.scene.visibility import share_in_view
 
 CFG = DataConfig()
@@ -226,6 +227,19 @@ def test_pictures_of_a_whole_sphere_are_refused_with_a_remedy(tmp_path):
         path.rename(tmp_path / "a.insv")
     with helpers.refused("no scene in", "name the video itself"):
         find_scene(tmp_path, CFG)
+
+
+def test_a_note_counts_pictures_in_folders_of_maps(tmp_path):
+    """Brackets may lie in folders named dark, normal and bright."""
+    for name in ("dark/1.jpg", "normal/1.jpg", "bright/1.jpg"):
+        path = tmp_path / "images" / name
+        path.parent.mkdir(parents=True)
+        Image.new("RGB", (32, 24)).save(path)
+    found = find_scene(tmp_path, CFG)
+    assert isinstance(found, PhotographsAlone)
+    assert [path.parent.name for path in found.paths] == ["bright", "dark"]
+    assert "1 of the pictures count as depth maps" in found.notes[0]
+    assert "normal/1.jpg" in " ".join(survey(tmp_path, CFG).sentences)
 
 
 def test_notes_name_times_and_depths_that_are_not_used(tmp_path):
