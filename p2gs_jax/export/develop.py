@@ -27,7 +27,7 @@ from p2gs_jax.core.text import first_few
 from p2gs_jax.core.threads import map_in_order
 from p2gs_jax.errors import UserError
 from p2gs_jax.export.film import Film, Finish, across, common_curve, dithered
-from p2gs_jax.export.folders import MODES, RGB, mask_name, write_photograph
+from p2gs_jax.export.folders import RGB, is_copied, mask_name, write_photograph
 from p2gs_jax.export.poses import Poses, write_if_new
 from p2gs_jax.formats.exr import write_exr
 from p2gs_jax.formats.frames import shrunk
@@ -36,7 +36,6 @@ from p2gs_jax.photometry.display import mean_parameters
 from p2gs_jax.photometry.formation import exposed_at
 from p2gs_jax.photometry.parameters import initial_photometry
 from p2gs_jax.run.decisions import decide
-from p2gs_jax.scene.convert.icc import profile_of
 from p2gs_jax.scene.files import file_fingerprints
 from p2gs_jax.scene.pixels.decode import floats, stored
 from p2gs_jax.types import Photometry, Scene, View
@@ -56,7 +55,6 @@ _FORMATS: dict[Depth, tuple[tuple[str, ...], str, int]] = {
 _BELOW_WHITE = 0.999
 # Number of photographs on the sheet, and their longer side, pixels.
 _SHOWN, _SMALL = 12, 480
-_ORIENTATION = 0x0112  # EXIF tag
 # EXIF tags of exposure time, f-number, sensitivities and APEX values, which describe the original.
 _EXPOSURE = (0x829A, 0x829D, 0x8827, 0x8830, 0x8831, 0x8832, 0x8833, 0x9201, 0x9202, 0x9204)
 _COMMENT = "linear relative radiance times the common exposure of all photographs"
@@ -242,7 +240,9 @@ def _develop(
         alpha = None if opacity is None else floats(opacity)
         light = light if alpha is None else light * alpha[..., None]
         write_exr(target, light, alpha=alpha, comments=_COMMENT)
-    elif options.depth == "16bit" or not film.changes_nothing(codes) or not _copied(view, target):
+    elif options.depth == "8bit" and film.changes_nothing(codes) and is_copied(view, target):
+        write_if_new(target, view.image_path.read_bytes())
+    else:
         found = film.developed(pixels, codes)
         found = dithered(found, view.name) if options.depth == "8bit" else found
         if opacity is not None:
@@ -253,17 +253,6 @@ def _develop(
         _write_mask(folder / _mask_of(place), valid)
     shares = {"masked": ~valid, "clipped": clipped, "black": black}
     return {"size": valid.shape, **{name: float(each.mean()) for name, each in shares.items()}}
-
-
-def _copied(view: View, target: Path) -> bool:
-    """Copy a photograph; False: its suffix, orientation, mode or profile rules this out."""
-    same = view.image_path.suffix.lower() == target.suffix.lower()
-    with contextlib.suppress(OSError), Image.open(view.image_path) as image:
-        upright = image.getexif().get(_ORIENTATION, 1) in (0, 1)
-        if same and upright and image.mode in MODES and profile_of(image) is None:
-            write_if_new(target, view.image_path.read_bytes())
-            return True
-    return False
 
 
 def _exif(view: View) -> Image.Exif | None:

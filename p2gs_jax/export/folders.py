@@ -26,6 +26,8 @@ from p2gs_jax.photometry.observations import grouped
 from p2gs_jax.run.photometry_files import ViewPhotometry
 from p2gs_jax.scene import ImageStore
 from p2gs_jax.scene.convert.convert import kept_settings, write_png
+from p2gs_jax.scene.convert.icc import profile_of
+from p2gs_jax.scene.pixels.decode import floats
 from p2gs_jax.types import Scene, Tracks, View
 
 JPEG_QUALITY = 98
@@ -59,7 +61,8 @@ def write_folder(
         masked = False
         for index, view in enumerate(scene.views):
             ldr, mask = store.get(index)
-            _write_photograph(temporary / "images" / names[view.name], view, ldr)
+            place = temporary / "images" / names[view.name]
+            _write_photograph(place, view, _with_alpha(ldr, store, index))
             path = temporary / mask_name(names[view.name])
             path.parent.mkdir(parents=True, exist_ok=True)
             # 255 marks pixels that count.
@@ -168,21 +171,45 @@ def _write_model(folder: Path, scene: Scene, store: ImageStore, names: Mapping[s
     model.write_binary(str(folder))
 
 
-def _write_photograph(path: Path, view: View, ldr: Float[np.ndarray, "h w 3"]) -> None:
-    """Copy the file if the fit neither undistorts nor resizes it; otherwise encode `ldr` in sRGB.
+def _with_alpha(
+    ldr: Float[np.ndarray, "h w 3"], store: ImageStore, index: int
+) -> Float[np.ndarray, "h w c"]:
+    """Return display values; if the photograph has alpha, with it and without the backdrop."""
+    opacity = store.alpha(index)
+    if opacity is None or opacity.min() == np.iinfo(opacity.dtype).max:
+        return ldr
+    alpha = floats(opacity)[..., None]
+    own = (ldr - (1 - alpha) * store.backdrop) / np.maximum(alpha, 1e-6)
+    return np.concatenate([np.clip(own, 0, 1), alpha], 2)
 
-    A new file keeps the camera settings in EXIF, but not the tag of another colour space.
+
+def is_copied(view: View, path: Path) -> bool:
+    """Return whether programs read the same from a copy of the photograph at `path` as we do.
+
+    The suffix of `path`, the orientation in EXIF, the mode or a colour profile may rule this out.
+    """
+    with contextlib.suppress(OSError), Image.open(view.image_path) as image:
+        upright = image.getexif().get(ExifTags.Base.Orientation, 1) in (0, 1)
+        same = view.image_path.suffix.lower() == path.suffix.lower()
+        return same and upright and image.mode in MODES and profile_of(image) is None
+    return False
+
+
+def _write_photograph(path: Path, view: View, shown: Float[np.ndarray, "h w c"]) -> None:
+    """Copy the file if the fit neither undistorts nor resizes it; otherwise encode it in sRGB.
+
+    A new file keeps the camera settings in EXIF, but neither orientation nor colour space.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    unchanged = view.distortion is None and ldr.shape[1::-1] == (view.width, view.height)
-    exif, readable = None, False
-    with contextlib.suppress(OSError), Image.open(view.image_path) as original:
-        exif, readable = original.getexif(), original.mode in MODES
-        exif.get_ifd(ExifTags.IFD.Exif)  # read while the file is open
-    if unchanged and readable and view.image_path.suffix.lower() == path.suffix.lower():
+    unchanged = view.distortion is None and shown.shape[1::-1] == (view.width, view.height)
+    if unchanged and is_copied(view, path):
         shutil.copyfile(view.image_path, path)
         return
-    write_photograph(path, np.rint(255 * ldr).astype(np.uint8), exif)
+    exif = None
+    with contextlib.suppress(OSError), Image.open(view.image_path) as original:
+        exif = original.getexif()
+        exif.get_ifd(ExifTags.IFD.Exif)  # read while the file is open
+    write_photograph(path, np.rint(255 * shown).astype(np.uint8), exif)
 
 
 def write_photograph(path: Path, pixels: np.ndarray, exif: Image.Exif | None) -> None:

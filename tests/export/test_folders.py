@@ -154,6 +154,39 @@ def test_every_format_is_read_back_with_its_colours(tmp_path, suffix, write, pro
         read_known_exposures(root / "out" / "exposures.csv", after.views[1:3])
 
 
+@pytest.mark.parametrize("width", [56, None])
+def test_photographs_with_alpha_keep_it(tmp_path, width):
+    """Over the backdrop they would show a white wall behind every object."""
+    alpha = np.zeros((100, 112), np.uint8)
+    alpha[20:80, 20:90] = 255
+
+    def write(path, image):
+        image.putalpha(Image.fromarray(alpha))
+        image.save(path)
+
+    _, ours, after = export(
+        rewrite(make_scene(tmp_path), ".png", write), DataConfig(max_width=width)
+    )
+    theirs = ImageStore(after.views, DataConfig())
+    for index in range(6):
+        np.testing.assert_allclose(theirs.get(index)[0], ours.get(index)[0], atol=2 / 255)
+        found = theirs.alpha(index) / np.iinfo(theirs.alpha(index).dtype).max
+        wanted = ours.alpha(index) / np.iinfo(ours.alpha(index).dtype).max
+        np.testing.assert_allclose(found, wanted, atol=1 / 255)
+        assert found.min() == 0
+
+
+def test_other_programs_turn_no_photograph(tmp_path):
+    """Their readers obey the orientation in EXIF, which our poses and theirs do not."""
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    root = rewrite(make_scene(tmp_path), ".jpg", lambda path, image: image.save(path, exif=exif))
+    export(root, DataConfig())
+    with Image.open(root / "out" / "images" / "0.jpg") as image:
+        assert image.size == (112, 100)
+        assert 0x0112 not in image.getexif()
+
+
 @pytest.mark.parametrize("program", ["colmap", "nerfstudio"])
 def test_masks_are_written_for_all_views_once_one_has_any(tmp_path, program):
     root = make_scene(tmp_path)
