@@ -18,6 +18,7 @@ from p2gs_jax.paths.files import near_scene
 from p2gs_jax.paths.shots import Shot
 from p2gs_jax.scene import ImageStore, PhotographsAlone, find_scene
 from p2gs_jax.scene.cameras import name_cameras
+from p2gs_jax.scene.convert.readers import read_exif_camera
 from p2gs_jax.scene.files import find_names, is_panorama, same_aspect
 from p2gs_jax.scene.rigid import require_axes
 from p2gs_jax.scene.survey import survey
@@ -284,6 +285,18 @@ LAYOUTS = {
 def test_views_are_grouped_by_camera(tmp_path, by, names, cameras, expected):
     views = views_of(tmp_path, *names, **cameras)
     assert [view.camera for view in name_cameras(views, by)] == expected
+
+
+@pytest.mark.parametrize("tag", [0x920A, 0xA404, 0xA405])
+def test_optical_and_digital_zoom_have_their_focal_lengths(tmp_path, tag):
+    for zoom in (1, 2):
+        exif = Image.Exif()
+        exif[0x0110] = "A"
+        exif.get_ifd(0x8769)[tag] = 24 * zoom
+        Image.new("RGB", (8, 8)).save(tmp_path / f"{zoom}.jpg", exif=exif)
+    one, two = (read_exif_camera(tmp_path / f"{zoom}.jpg", zoom=True) for zoom in (1, 2))
+    assert one != two
+    assert read_exif_camera(tmp_path / "1.jpg") == read_exif_camera(tmp_path / "2.jpg") == "A"
 
 
 def test_cameras_differ_by_the_lenses_of_frames(tmp_path):

@@ -54,10 +54,10 @@ _COMPRESSION = 1
 _SIGNATURE_AND_HEADER = 8 + 25  # bytes of a PNG
 # EXIF tags that are copied: make and model.
 _KEPT = (0x010F, 0x0110)
-# Exposure time, f-number, sensitivities, date, focal length, its 35 mm equivalent, serial, lens.
+# Exposure time, f-number, sensitivities, date, zoom, serial and lens.
 _KEPT_EXIF = (
     *(0x829A, 0x829D, 0x8827, 0x8830, 0x8831, 0x8832, 0x8833),
-    *(0x9003, 0x9011, 0x9291, 0x920A, 0xA405, 0xA431, 0xA434),
+    *(0x9003, 0x9011, 0x9291, 0x920A, 0xA404, 0xA405, 0xA431, 0xA434),
 )
 _NO_ROOM = "free space on that disk, or name another --out"
 

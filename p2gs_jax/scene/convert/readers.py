@@ -44,6 +44,8 @@ _KINDS: dict[str, Kind] = {
 CONVERTED_SUFFIXES = frozenset(_KINDS)
 """Suffixes of files that must be converted."""
 _TIME, _F_NUMBER, _ISO, _FOCAL_LENGTH, _DATE = 0x829A, 0x829D, 0x8827, 0x920A, 0x9003
+# Focal length, that of the field of view on 35 mm film, and digital zoom.
+_ZOOM = (_FOCAL_LENGTH, 0xA405, 0xA404)
 # _ISO has 16 bits: 65535 means that another of these tags holds the value.
 _SENSITIVITIES = (_ISO, 0x8833, 0x8832, 0x8831)
 # APEX values (log2, stops) from this size on are broken.
@@ -399,10 +401,10 @@ def _original(path: Path) -> Path:
 def read_exif_camera(path: Path, *, zoom: bool = False) -> str:
     """Return make, model, serial number and lens as one string; empty without EXIF.
 
-    With `zoom`, the focal length is added. EXIF after the pixels of a PNG is not read.
+    With `zoom`, optical and digital zoom are added. EXIF after the pixels of a PNG is not read.
     """
     tags = _exif_tags(path, after_pixels=False)
-    wanted = (_MAKE, _MODEL, _SERIAL, _LENS, *([_FOCAL_LENGTH] if zoom else []))
+    wanted = (_MAKE, _MODEL, _SERIAL, _LENS, *(_ZOOM if zoom else ()))
     parts = (tags.get(tag) for tag in wanted)
     return " ".join(str(part).strip("\0 ") for part in parts if part is not None)
 
