@@ -201,7 +201,7 @@ def write_solution(
         mean={
             "exposure": float(e.mean()) if e.size else 1.0,
             "exposure_geometric": float(np.exp(np.log(e).mean())) if e.size else 1.0,
-            "gamma": float(s.gammas.mean()),
+            "gamma": float(s.gammas[solved].mean() if solved.any() else s.gammas.mean()),
         },
         views=rows,
         cameras=_camera_rows(s.cameras, s.corner_errors),

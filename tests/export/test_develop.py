@@ -26,6 +26,7 @@ from p2gs_jax.photometry.formation import formation
 from p2gs_jax.photometry.response import Response
 from p2gs_jax.photometry.solution import PhotometricSolution
 from p2gs_jax.run.decisions import decide
+from p2gs_jax.run.photometry_files import read_photometry, write_solution
 from p2gs_jax.scene import find_scene, with_masks_and_split
 from p2gs_jax.scene.exposures import read_known_exposures
 from p2gs_jax.scene.masks import with_alpha
@@ -290,6 +291,15 @@ def test_photographs_without_an_exposure_are_developed_and_named(tmp_path):
     assert (out / "images" / "2.png").is_file()
     row = list(csv.DictReader((out / "exposures.csv").open()))[2]
     assert (row["original_ev"], float(row["gain_ev"])) == ("", pytest.approx(0.0, abs=1e-6))
+
+
+def test_the_mean_gamma_of_a_calibration_is_that_of_solved_photographs(tmp_path):
+    """Radiance of other trainers is decoded with it, after development with the same gamma."""
+    gammas = np.where(np.arange(6) == 2, 2.2, 1.9)
+    found = selection_of(**{**PLAIN, "gammas": gammas}, seen=np.arange(6) != 2).solution
+    views = read(scene_of(tmp_path, selection_of(**PLAIN))).views
+    write_solution(tmp_path / "p.json", found, views=views, pivot=0.5, gauge="")
+    assert read_photometry(tmp_path / "p.json")["mean"]["gamma"] == pytest.approx(1.9)
 
 
 @pytest.mark.parametrize("kind", ["transforms", "blender", "llff"])

@@ -51,6 +51,8 @@ _SENSITIVITIES = (_ISO, 0x8833, 0x8832, 0x8831)
 # APEX values (log2, stops) from this size on are broken.
 _SHUTTER_SPEED, _APERTURE, _LARGEST_APEX = 0x9201, 0x9202, 32.0
 _MAKE, _MODEL, _SERIAL, _LENS = 0x010F, 0x0110, 0xA431, 0xA434
+# Last parts of the names of layers that hold the picture in OpenEXR; without a layer it is "".
+_PICTURES = ("", "combined", "beauty", "rgba")
 # Attributes of LibRaw.
 _RAW_SETTINGS = {"shutter_speed": _TIME, "aperture": _F_NUMBER, "iso_speed": _ISO}
 _RAW_SETTINGS |= {"focal_length": _FOCAL_LENGTH}
@@ -266,13 +268,19 @@ def read_exr(path: Path) -> Picture:
     """Return the light of an OpenEXR: channels R, G, B (even in a layer) or Y.
 
     Colours are converted from the header's chromaticities, and divided by their alpha (A). Raises
-    UserError: the file is not a readable OpenEXR, or has no such channels.
+    UserError: the file is not a readable OpenEXR, has no such channels, or several layers of them
+    and none is called as the picture usually is; or its pixels do not cover exactly its frame.
     """
     with _exr(path, separate_channels=True) as file:
         channels: dict[str, Any] = {k: c.pixels for k, c in file.channels().items()}
         header = dict(file.header())
-    layers = {k[: -len("R")] for k in channels if k == "R" or k.endswith(".R")}
-    layer = "" if "" in layers else next(iter(sorted(layers)), None)
+    _exr_size(path, header)
+    layers = sorted(k[: -len("R")] for k in channels if k == "R" or k.endswith(".R"))
+    pictures = [k for k in layers if k.rpartition(".")[0].rpartition(".")[2].lower() in _PICTURES]
+    if len(layers) > 1 and len(pictures) != 1:
+        why = f"has the layers {', '.join(k.strip('.') for k in layers)}."
+        raise broken(path, why, "save it with one layer, that of the picture")
+    layer = next(iter(pictures or layers), None)
     if layer is not None and {layer + "G", layer + "B"} <= channels.keys():
         light = np.stack([channels[layer + c] for c in "RGB"], -1).astype(np.float32)
     elif "Y" in channels and "RY" not in channels:
@@ -326,9 +334,22 @@ def size_of(path: Path) -> tuple[int, int] | None:
         return read_facts(path).size
     if kind == "exr":
         with _exr(path, header_only=True) as file:
-            low, high = file.header()["dataWindow"]
-        return int(high[0] - low[0] + 1), int(high[1] - low[1] + 1)
+            return _exr_size(path, dict(file.header()))
     return None
+
+
+def _exr_size(path: Path, header: dict) -> tuple[int, int]:
+    """Return width and height; UserError: the pixels do not cover exactly the frame."""
+    sizes = {}
+    for name in ("dataWindow", "displayWindow"):
+        low, high = header[name]
+        sizes[name] = (int(high[0] - low[0] + 1), int(high[1] - low[1] + 1), *map(int, low))
+    data, frame = sizes["dataWindow"], sizes["displayWindow"]
+    if data != frame:
+        why = f"has {data[0]}x{data[1]} pixels at {data[2:]} in a frame of {frame[0]}x{frame[1]}, "
+        why += "and intrinsics belong to the frame."
+        raise broken(path, why, "save it without a crop or overscan")
+    return data[:2]
 
 
 @dataclass(frozen=True)

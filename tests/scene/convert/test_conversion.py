@@ -8,6 +8,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import OpenEXR
 import pytest
 from PIL import Image, ImageCms, features
 from scene.convert import made
@@ -257,6 +258,18 @@ def test_nan_alpha_and_chromaticities_of_exr_are_converted(folder: Path) -> None
     assert light_of(c)[4, 4] == pytest.approx((0, 0.521, 0), abs=2e-3)
 
 
+def write_channels(path: Path, channels: dict[str, np.ndarray]) -> None:
+    with OpenEXR.File({"type": OpenEXR.scanlineimage}, channels) as file:
+        file.write(str(path))
+
+
+def test_the_picture_is_read_among_the_layers_of_an_exr(folder: Path) -> None:
+    values = {"ViewLayer.AO": 0.9, "ViewLayer.Combined": 0.3}
+    both = {f"{k}.{c}": np.full((8, 8), v, np.float32) for k, v in values.items() for c in "RGB"}
+    write_channels(folder / "a.exr", both)
+    assert light_of(converted(folder).paths[0])[4, 4] == pytest.approx(0.3, abs=1e-4)
+
+
 def test_unsupported_and_broken_files_are_refused(folder: Path) -> None:
     def refuse(name: str, *words: str) -> None:
         with refused(*words):
@@ -269,6 +282,12 @@ def test_unsupported_and_broken_files_are_refused(folder: Path) -> None:
     refuse("a.exr", r"a\.exr is not a readable OpenEXR")
     made.write_exr(folder / "b.exr", np.ones((8, 8, 1), np.float32), "Z")
     refuse("b.exr", "has the channels Z")
+    part = np.ones((8, 8), np.float32)
+    write_channels(folder / "c.exr", {f"{k}.{c}": part for k in ("albedo", "ao") for c in "RGB"})
+    refuse("c.exr", "has the layers albedo, ao", "save it with one layer")
+    frame = (np.array([0, 0], np.int32), np.array([15, 15], np.int32))
+    made.write_exr(folder / "d.exr", np.ones((8, 8, 3), np.float32), displayWindow=frame)
+    refuse("d.exr", "has 8x8 pixels at .* in a frame of 16x16", "without a crop")
     made.save_heic(folder / "a.heic", np.full((64, 64, 3), 90, np.uint8))
     (folder / "a.heic").write_bytes((folder / "a.heic").read_bytes()[:-9])
     refuse("a.heic", r"a\.heic cannot be decoded: .*[^.\s]\.\n", "copy that photograph again")
