@@ -14,9 +14,10 @@ import numpy as np
 
 from benchmarks.oracle import FIELDS
 from p2gs_jax.config import RenderConfig
-from p2gs_jax.render import project, render_linear, view_radiance
+from p2gs_jax.render import project, render_linear
 from p2gs_jax.render.binning_cpu import grid_size
 from p2gs_jax.render.harmonics import C0
+from p2gs_jax.render.project import view_radiance
 from p2gs_jax.types import Camera, Gaussians, Splats2D
 
 # A near plane that float32 represents exactly, so that "on the plane" means the same in float64.

@@ -17,7 +17,8 @@ from jaxtyping import Float
 
 from p2gs_jax.config import RenderConfig
 from p2gs_jax.core.numerics import srgb_encode
-from p2gs_jax.render import project, rasterize, view_radiance
+from p2gs_jax.render import project, rasterize
+from p2gs_jax.render.project import view_radiance
 from p2gs_jax.types import Camera, Gaussians, Splats2D
 
 BLOCK = (32, 24)

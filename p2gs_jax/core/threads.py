@@ -21,7 +21,7 @@ def available_cores() -> int:
     """Return the number of cores for this process, by its affinity and its container's limit."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     # The file holds "QUOTA PERIOD" in microseconds, or "max PERIOD" without a limit.
-    quota, _, period = text_of(CGROUP / "cpu.max").strip().partition(" ")
+    quota, _, period = text_of(CGROUP / "cpu.max").partition(" ")
     if quota.isdecimal() and period.isdecimal():
         cores = min(cores or 1, int(quota) // max(int(period), 1))
     return max(cores or 1, 1)

@@ -76,11 +76,7 @@ def pack(gaussians: Gaussians) -> Packed:
     columns = columns[:, morton_order(np.asarray(gaussians.means))]
     count, coefficients = gaussians.capacity, gaussians.sh.shape[1]
     starts = np.arange(0, count, CHUNK)
-    if count:
-        low = np.minimum.reduceat(columns, starts, axis=1)
-        high = np.maximum.reduceat(columns, starts, axis=1)
-    else:
-        low = high = np.zeros((len(columns), 0), np.float32)
+    low, high = (f.reduceat(columns, starts, axis=1) for f in (np.minimum, np.maximum))
     parts = [np.stack([low, high], 1).astype("<f4").tobytes()]
     for row, bits in enumerate(column_bits(coefficients)):
         least, span = (np.repeat(v[row], CHUNK)[:count] for v in (low, high - low))

@@ -228,7 +228,7 @@ def neighbours(
 
     `seen` flags the points that each view sees.
     """
-    views = [scene.views[i] for i in scene.train_indices]
+    views = scene.training_views
     centers = camera_centers(views)
     score = np.zeros((len(views), len(views)))
     shared = seen.astype(np.float32) @ seen.T.astype(np.float32)

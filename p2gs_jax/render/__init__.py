@@ -7,8 +7,9 @@ from jaxtyping import Array, Bool, Float, Int
 
 from p2gs_jax.config import RenderConfig
 from p2gs_jax.render.binning import bin_tiles, count_entries
-from p2gs_jax.render.project import at_time, camera_of_each, project, view_radiance
+from p2gs_jax.render.project import at_time, camera_of_each, project
 from p2gs_jax.render.tiles import rasterize
+from p2gs_jax.render.visible import splat
 from p2gs_jax.types import Camera, Gaussians, Render, Splats2D
 
 
@@ -32,11 +33,8 @@ def render_linear(
     """
     if gaussians.capacity == 0:
         return _empty_render(camera, cfg, with_depth)
-    gaussians = at_time(gaussians, camera.objects)
-    of_each = camera_of_each(camera, owner)
-    splats = project(gaussians, alive, of_each, cfg)
-    radiance = view_radiance(gaussians, of_each, cfg, active_degree)
-    return render_splats(splats, radiance, camera, cfg, capacity, with_depth=with_depth)
+    shown = splat(gaussians, alive, camera, cfg, active_degree, owner)
+    return render_splats(*shown, camera, cfg, capacity, with_depth=with_depth)
 
 
 def render_splats(

@@ -16,9 +16,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from p2gs_jax.config import RenderConfig
-from p2gs_jax.render import count_entries, project, render_splats, view_radiance
+from p2gs_jax.render import count_entries, project, render_splats
 from p2gs_jax.render.capacity import PICTURES, bucket
 from p2gs_jax.render.harmonics import coefficient_count
+from p2gs_jax.render.project import view_radiance
 from p2gs_jax.types import Camera, Gaussians
 
 MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")

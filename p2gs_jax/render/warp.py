@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.scipy.ndimage import map_coordinates
 from jaxtyping import Array, Bool, Float
 
 from p2gs_jax.core.numerics import matmul, namespace
@@ -94,14 +97,6 @@ def warp(
 
 def sample_bilinear(image: Float[Array, "h w c"], xy: Float[Array, "*n 2"]) -> Float[Array, "*n c"]:
     """Return the image at pixel positions (centres at +0.5), clamped to the border."""
-    height, width, _ = image.shape
-    limit = jnp.array([width - 1.0, height - 1.0])
-    position = jnp.clip(xy - 0.5, 0.0, limit)
-    corner = jnp.minimum(jnp.floor(position), limit - 1).astype(jnp.int32)
-    corner = jnp.maximum(corner, 0)
-    fx, fy = (position - corner)[..., :1], (position - corner)[..., 1:]
-    left, top = corner[..., 0], corner[..., 1]
-    right, bottom = jnp.minimum(left + 1, width - 1), jnp.minimum(top + 1, height - 1)
-    upper = image[top, left] * (1 - fx) + image[top, right] * fx
-    lower = image[bottom, left] * (1 - fx) + image[bottom, right] * fx
-    return upper * (1 - fy) + lower * fy
+    rows = [xy[..., 1] - 0.5, xy[..., 0] - 0.5]
+    channel = partial(map_coordinates, coordinates=rows, order=1, mode="nearest")
+    return jax.vmap(channel, -1, -1)(image)

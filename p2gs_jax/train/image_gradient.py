@@ -7,10 +7,11 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
+from jax.typing import DTypeLike
 from jaxtyping import Bool, Float, Int
 
 from p2gs_jax.config import FitConfig
+from p2gs_jax.evaluation.scores import psnr
 from p2gs_jax.photometry.appearance import Correction, Corrections, correction_of
 from p2gs_jax.photometry.formation import Matte, composited, formation, uncovered
 from p2gs_jax.photometry.luminance import Curves
@@ -82,18 +83,16 @@ def decoded(batch: Batch) -> tuple[Float[Array, "h w 3"], Float[Array, "h w"]]:
     A photograph with alpha is composited over its backdrop. Both have the precision of the camera.
     """
     kind = batch.camera.K.dtype
-    ldr = batch.ldr.astype(kind)
-    scale = float(np.iinfo(batch.ldr.dtype).max) if batch.ldr.dtype.kind == "u" else 1.0
-    ldr = ldr / scale
+    ldr = unit(batch.ldr, kind)
     if batch.alpha is not None and batch.backdrop is not None:
         ldr = ldr + (1 - unit(batch.alpha)[..., None]) * batch.backdrop
     return ldr, batch.mask.astype(kind)
 
 
-def unit(stored: Array) -> Float[Array, "..."]:
-    """Return stored unsigned integers as floats in [0, 1]; floats stay unchanged."""
+def unit(stored: Array, kind: DTypeLike = jnp.float32) -> Float[Array, "..."]:
+    """Return stored unsigned integers as floats in [0, 1]; floats keep their values."""
     scale = float(jnp.iinfo(stored.dtype).max) if stored.dtype.kind == "u" else 1.0
-    return stored.astype(jnp.float32) / scale
+    return stored.astype(kind) / scale
 
 
 def pixel_places(shape: tuple[int, ...], size: Float[Array, " 2"]) -> Float[Array, "h w 2"]:
@@ -193,8 +192,6 @@ def differentiate(
         image_loss, argnums=(0, 1, 2), has_aux=True, allow_int=True
     )(shown, photometry, appearance, batch, partner, cfg, dict(terms), capacity)
     photograph, mask = decoded(batch)
-    squared = mask[..., None] * (jnp.clip(ldr, 0, 1) - photograph) ** 2
-    mse = jnp.sum(squared) / jnp.maximum(3 * jnp.sum(mask), 1)
     return ImageGradient(
         loss,
         values,
@@ -203,7 +200,7 @@ def differentiate(
         render.count,
         render.overflow,
         render.visible,
-        -10 * jnp.log10(jnp.maximum(mse, 1e-10)),
+        psnr(jnp.clip(ldr, 0, 1), photograph, mask),
     )
 
 

@@ -56,8 +56,7 @@ class Records:
             self._log.unlink(missing_ok=True)
             return None
         state, host = restored
-        kept = read_jsonl(self._log) if self._log.exists() else []
-        kept = [line for line in kept if line["step"] <= host.step]
+        kept = [line for line in read_jsonl(self._log) if line["step"] <= host.step]
         if planned > host.planned > 0:
             host = host.extended(planned)
             self.on_message(f"The run is planned for longer: {host.progress:.0%} of it is done.")

@@ -14,7 +14,7 @@ from p2gs_jax.config import FitConfig, InitConfig
 from p2gs_jax.gaussians import seeds
 from p2gs_jax.gaussians.shell import find_shell, sphere_behind
 from p2gs_jax.pipeline.survey import load, scale_notes
-from p2gs_jax.render import view_radiance
+from p2gs_jax.render.project import view_radiance
 
 
 def view(x=0.0):

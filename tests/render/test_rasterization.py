@@ -10,8 +10,9 @@ from scenes import camera, street
 
 import p2gs_jax
 from p2gs_jax.config import RenderConfig
-from p2gs_jax.render import render_linear, view_radiance
+from p2gs_jax.render import render_linear
 from p2gs_jax.render.harmonics import C0
+from p2gs_jax.render.project import view_radiance
 
 CFG = RenderConfig(pixels_in_flight=2048, near=0.01)
 WIDTH, HEIGHT = 48, 36

@@ -10,7 +10,8 @@ import pytest
 from scenes import street
 
 from p2gs_jax.config import RenderConfig
-from p2gs_jax.render import bin_tiles, project, render_linear, required_capacity, view_radiance
+from p2gs_jax.render import bin_tiles, project, render_linear, required_capacity
+from p2gs_jax.render.project import view_radiance
 
 BEHIND = (0.5, 2.0, 7.0)
 CFG = RenderConfig(pixels_in_flight=2048, background=BEHIND, stop_error=1e-4)

@@ -10,8 +10,8 @@ import pytest
 import splats
 
 from p2gs_jax import Render, RenderConfig
-from p2gs_jax.render import view_radiance
 from p2gs_jax.render import warp as warping
+from p2gs_jax.render.project import view_radiance
 
 WIDTH, HEIGHT = 24, 16
 Y, X = np.mgrid[:HEIGHT, :WIDTH] + 0.5

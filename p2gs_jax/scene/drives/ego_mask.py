@@ -298,8 +298,7 @@ def _solid_parts(found: Bool[np.ndarray, "h w"], evidence: Evidence) -> Bool[np.
         at_border = part[[0, -1]].any() or part[:, [0, -1]].any()
         if not at_border or part.mean() < LEAST_SHARE:
             continue
-        grown = np.pad(part, 1, mode="edge")
-        inner = cv2.erode(grown.astype(np.uint8), np.ones((3, 3), np.uint8))[1:-1, 1:-1]
+        inner = cv2.erode(part.astype(np.uint8), np.ones((3, 3), np.uint8))
         rim = part & (inner == 0)
         length = max(int(rim.sum()), 1)
         if near[rim].sum() < EDGE_SHARE * length:
