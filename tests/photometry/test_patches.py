@@ -122,6 +122,18 @@ def test_normals_follow_flat_neighbourhoods_and_are_unknown_elsewhere():
     assert np.isnan(patches.surfaces_of(np.zeros((3, 3)), np.arange(3)).normals).all()
 
 
+def test_normals_of_sparse_points_ignore_those_of_other_surfaces():
+    """The nearest points lie on a wall, on the road below it and on cars: they are not flat."""
+    rng = np.random.default_rng(0)
+    wall = np.c_[rng.uniform(0, 20, 300), np.zeros(300), rng.uniform(0, 4, 300)]
+    road = np.c_[rng.uniform(0, 20, 200), rng.uniform(-3, 0, 200), np.zeros(200)]
+    others = rng.uniform([0, -1, 0], [20, 0, 2], (60, 3))
+    points = np.concatenate([wall, road, others]) + 0.02 * rng.standard_normal((560, 3))
+    found = np.abs(patches.surfaces_of(points, np.arange(560)).normals)
+    right = np.concatenate([found[:300, 1], found[300:500, 2]]) > np.cos(np.radians(15))
+    assert right.mean() > 0.8
+
+
 def symmetric(values):
     return np.stack([values[:, [0, 1]], values[:, [1, 2]]], 1)
 
