@@ -45,6 +45,8 @@ JUDGED = 0.05  # least share of observations that are held out and have a partne
 MOST_OBSERVATIONS = 40_000
 SPLINE_OBSERVATIONS = 12_000  # a curve has few parameters, and its basis is the most expensive
 
+AVERAGED = 2  # times that a curve is fitted to means of light under itself
+
 OnChosen = Callable[[Form, Response], None]
 # Beginning of the note with the numbers of a choice. A gain from CLEARLY on, nat, counts as clear.
 NUMBERS = "Held-out log-likelihood per observation beside the model kept (0.01 is little, 1 a lot)"
@@ -200,9 +202,27 @@ def _fixed(
         base, beside = Response(curve.base), form._replace(model="view_exposure")
         fitted = fit_response(few, base, form=beside, by=curve.splines or "all")
         collapsed = () if fitted else (COLLAPSED.format(base.name),)
-        curve, free = fitted or base, free or fitted is not None
+        free = free or fitted is not None
+        curve = _under_itself(few, options, form, fitted or base)
     notes = (*_notes(problem, free=free), *collapsed)
-    return Selection(fit_model(problem, form, curve), (), notes)
+    return Selection(_solved(observations, options, form, curve), (), notes)
+
+
+def _under_itself(
+    few: Problem, options: CalibrationOptions, form: Form, response: Response
+) -> Response:
+    """Return a curve, fitted again to means of light under itself if it has a spline."""
+    how = {"form": form._replace(model="view_exposure"), "by": response.by}
+    for _ in range(AVERAGED if response.spline else 0):
+        again = options.problem(few.observations.averaged(response))
+        response = fit_response(again, Response(response.base), **how) or response
+    return response
+
+
+def _solved(
+    observations: Observations, options: CalibrationOptions, form: Form, response: Response
+) -> PhotometricSolution:
+    return fit_model(options.problem(observations.averaged(response)), form, response)
 
 
 def _by_one_response(problem: Problem) -> Selection:
@@ -297,7 +317,8 @@ def _chosen(
             f"{loose} of the {len(search.fits)} models compared had not converged after "
             f"{MOST_ROUNDS} rounds; their state after these rounds was compared."
         )
-    solution = fit_model(problem, chosen.form, chosen.response)
+    response = _under_itself(few, used, chosen.form, chosen.response)
+    solution = _solved(observations, options, chosen.form, response)
     return Selection(solution, tuple(candidates), (*notes, *_reasons(chosen, candidates)))
 
 

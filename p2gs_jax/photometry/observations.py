@@ -9,8 +9,9 @@ import scipy.sparse as sp
 from jaxtyping import Bool, Float, Int
 from scipy.sparse.csgraph import connected_components
 
+from p2gs_jax.core.numerics import srgb_decode, srgb_encode
 from p2gs_jax.core.streams import Stream, generator
-from p2gs_jax.photometry.response import Response, deviation, log_exposed
+from p2gs_jax.photometry.response import DARKEST, Response, deviation, log_exposed
 
 # An integer per observation; a value per observation and channel.
 Labels = Int[np.ndarray, " o"]
@@ -22,6 +23,8 @@ PerChannel = Float[np.ndarray, "o 3"]
 COARSEST, COARSEST_TIE = 3.0, 9.0
 # Least share of a view's observations that are used although noise is clipped at black.
 FEWEST_USED = 0.05
+# Steps that invert a response, from the display value under sRGB.
+NEWTON_STEPS = 3
 
 
 @dataclass(frozen=True)
@@ -41,6 +44,8 @@ class Observations:
     positions: Float[np.ndarray, "o 2"] | None = None
     camera_names: tuple[str, ...] = ()  # names of the cameras; empty: their rows
     brightest: PerChannel | None = None  # largest value of the pixels that were averaged
+    # Standard deviation of their linear values under sRGB, over the mean; None: unknown.
+    contrast: PerChannel | None = None
     # Cell of the scene in which each point lies; it shares unmodelled errors. None: unknown.
     cells: Labels | None = None
     # Log2 of a pixel's width on the surface, up to a constant; None: unknown.
@@ -61,6 +66,24 @@ class Observations:
         pair = (log_exposed(v, response, self.cameras[self.views]) for v in (y, shown))
         (z, slope), (_, there) = pair
         return z, deviation(shown, there, self.spread, response.base), slope
+
+    def averaged(self, response: Response) -> Observations:
+        """Return the observations with means of light under a response, instead of under sRGB.
+
+        Near views average many pixels and far ones few, so that means under a wrong curve make
+        exposures drift along a drive. Two values represent a patch, with its mean and deviation.
+        """
+        if self.contrast is None or response == Response():
+            return self
+        mean, apart = srgb_decode(self.colors), np.minimum(self.contrast, 0.9)
+        both = [srgb_encode(np.minimum(mean * (1 + s * apart), 1.0)) for s in (-1, 1)]
+        cameras = self.cameras[self.views]
+        low, high = (log_exposed(np.float64(y), response, cameras)[0] for y in both)
+        wanted, y = np.logaddexp(low, high) - np.log(2), np.asarray(self.colors, np.float64)
+        for _ in range(NEWTON_STEPS):
+            z, slope = log_exposed(y, response, cameras)
+            y = np.clip(y + (wanted - z) / slope, DARKEST, 1.0)
+        return replace(self, colors=np.float32(y))
 
     def usable(self, black: float, saturation: float) -> Bool[np.ndarray, "o 3"]:
         """Return the mask of values neither black nor saturated, of points observed so twice.
@@ -95,7 +118,7 @@ class Observations:
     def picked(self, pick: np.ndarray | slice) -> Observations:
         """Return some of the observations, by a mask or by rows."""
         names = ["views", "points", "colors", "spread"]
-        names += ["positions", "brightest", "cells", "footprints", "expected"]
+        names += ["positions", "brightest", "contrast", "cells", "footprints", "expected"]
         kept = {k: v[pick] for k in names if (v := getattr(self, k)) is not None}
         return replace(self, **kept)
 

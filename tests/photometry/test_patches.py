@@ -1,5 +1,6 @@
 """Patches of a surface, alike in all views: a matte road must not bias exposures."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,11 +9,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.interpolate import RegularGridInterpolator
 
-from p2gs_jax.core.numerics import srgb_encode
+from p2gs_jax.core.numerics import srgb_decode, srgb_encode
 from p2gs_jax.photometry.adjustment.errors import SHARED_REGION, regions
 from p2gs_jax.photometry.adjustment.fit import fit_model
 from p2gs_jax.photometry.calibrate import CalibrationOptions, calibrate_observations, held_out
 from p2gs_jax.photometry.models import Form
+from p2gs_jax.photometry.observations import Observations
+from p2gs_jax.photometry.response import KNOTS, Response, log_exposed
 from p2gs_jax.photometry.sources import patches
 from p2gs_jax.photometry.sources.points import track_colors
 from p2gs_jax.render.warp import project_points
@@ -56,9 +59,8 @@ class Road(ImageStore):
         return np.repeat(ldr[..., None], 3, 2), seen
 
 
-@pytest.fixture(scope="module")
-def road():
-    """Return observations of 4,000 points of the road in twelve views that are 0.8 m apart."""
+def observed(store):
+    """Return observations of 4,000 points of a road in twelve views that are 0.8 m apart."""
     rng = np.random.default_rng(1)
     points = np.stack([rng.uniform(-4, 4, 4000), np.full(4000, 1.5), rng.uniform(3, 38, 4000)], 1)
     views, which, seen, places = [], [], [], []
@@ -73,9 +75,17 @@ def road():
         places.append(xy[inside])
     tracks = Tracks(*(np.concatenate(part) for part in (which, seen, places)))
     grey = np.full((len(points), 3), 128, np.uint8)
-    return track_colors(Scene(Path("."), "made", tuple(views), points, grey, tracks), Road())
+    return track_colors(Scene(Path("."), "made", tuple(views), points, grey, tracks), store)
 
 
+@pytest.fixture(scope="module")
+def road():
+    """Return observations of the road under sRGB and one exposure."""
+    return observed(Road())
+
+
+# Exposures of the views under a filmic curve, stops.
+EV = np.array([0.4, -0.7, 0.9, -0.2, 0.6, -0.9, 0.1, 0.8, -0.5, 0.3, -0.8, 0.0])
 OPTIONS = CalibrationOptions(black=4 / 255, saturation=250 / 255, pivot=0.18)
 
 
@@ -132,6 +142,40 @@ def test_normals_of_sparse_points_ignore_those_of_other_surfaces():
     found = np.abs(patches.surfaces_of(points, np.arange(560)).normals)
     right = np.concatenate([found[:300, 1], found[300:500, 2]]) > np.cos(np.radians(15))
     assert right.mean() > 0.8
+
+
+SPLINE = tuple(0.4 * np.log(KNOTS / KNOTS[6]) ** 2 * np.sign(KNOTS - KNOTS[6]))
+
+
+@pytest.mark.parametrize("response", [Response(), Response("power"), Response("srgb", SPLINE)])
+def test_means_are_those_of_light_under_the_response(response):
+    y = np.random.default_rng(0).uniform(0.3, 0.6, (200, 2, 1)) * np.ones(3)
+    light = srgb_decode(y)
+    mean = light.mean(1)
+    contrast = light.std(1) / mean
+    rows = np.arange(200), np.arange(200)
+    seen = Observations(*rows, srgb_encode(mean), 0 * mean, 200, 200, np.zeros(200, int))
+    found = replace(seen, contrast=contrast).averaged(response).colors
+    wanted = np.log(np.exp(log_exposed(y, response)[0]).mean(1))
+    np.testing.assert_allclose(log_exposed(found, response)[0], wanted, atol=1e-4)
+
+
+def test_exposures_do_not_drift_along_a_road_under_a_filmic_curve(road):
+    """Patches are averaged as if photographs were sRGB, before the curve is known."""
+
+    class Film(Road):
+        def whole(self, index):
+            ldr, seen = super().whole(index)
+            light = srgb_decode(ldr) * np.exp2(EV[index]) * 1.5
+            light = light * (2.51 * light + 0.03) / (light * (2.43 * light + 0.59) + 0.14)
+            return np.rint(255 * np.clip(light, 0, 1) ** (1 / 1.6)).astype(np.float32) / 255, seen
+
+    solved = calibrate_observations(observed(Film()), OPTIONS).solution
+    assert solved.response.spline is not None
+    power, level = np.polyfit(EV, solved.exposures_ev, 1)
+    error = solved.exposures_ev - power * EV - level
+    # Means under sRGB give 0.0037 EV.
+    assert np.std(error) < 0.003
 
 
 def symmetric(values):

@@ -58,6 +58,7 @@ class Samples(NamedTuple):
     # Standard deviation of `colors` from uncertain positions: their deviation times the gradient.
     spread: Float32[np.ndarray, "o 3"]
     brightest: Float32[np.ndarray, "o 3"]  # largest display values of the averaged pixels
+    contrast: Float32[np.ndarray, "o 3"]  # standard deviation of linear values over their mean
     valid: np.ndarray  # [o] whether the whole patch is inside the image and its mask
 
 
@@ -84,17 +85,19 @@ def sample_patches(
 
     The average is over linear values. The position of a patch is uncertain by `deviation` pixels.
     """
-    colors, spread, brightest = (np.zeros((count, 3), np.float32) for _ in range(3))
+    colors, spread, brightest, contrast = (np.zeros((count, 3), np.float32) for _ in range(4))
     valid = np.zeros(count, bool)
     for rows, position, nearest in (_within(grid, *mask.shape[::-1]) for grid in grids):
         x, y = nearest[..., 0], nearest[..., 1]
         light = _between(ldr, position)
-        colors[rows] = srgb_encode(light.mean((1, 2)))
+        mean = light.mean((1, 2))
+        colors[rows] = srgb_encode(mean)
+        contrast[rows] = light.std((1, 2)) / np.maximum(mean, np.finfo(np.float32).tiny)
         spread[rows] = deviation * _steepness(light, position)
         # Interpolation reads neighbouring pixels as well.
         brightest[rows] = _neighbours(ldr, x, y, np.maximum).max((1, 2))
         valid[rows] = _neighbours(mask, x, y, np.minimum).min((1, 2)) > 0.99
-    return Samples(colors, spread, brightest, valid)
+    return Samples(colors, spread, brightest, contrast, valid)
 
 
 def _within(
@@ -181,12 +184,12 @@ def point_colors(
         good = found.valid
         at = places(centres[good], *mask.shape[::-1]).astype(np.float32)
         wide = -np.log2(scales[row][keep[row]][good]).astype(np.float32)
-        return (np.full(len(at), row), mine[good], *(v[good] for v in found[:3]), at, wide)
+        return (np.full(len(at), row), mine[good], *(v[good] for v in found[:4]), at, wide)
 
     rows = [row for row, kept in enumerate(keep) if kept.any()]
     nothing, none = np.zeros((0, 3), np.float32), np.zeros(0, int)
     parts: list[tuple[np.ndarray, ...]] = [
-        (none, none, *[nothing] * 3, nothing[:, :2], nothing[:, 0])
+        (none, none, *[nothing] * 4, nothing[:, :2], nothing[:, 0])
     ]
     for done, found in enumerate(map_in_order(read, rows)):
         parts.append(found)
@@ -194,7 +197,7 @@ def point_colors(
             return_freed_memory()
         if on_view is not None:
             on_view(done + 1, len(rows))
-    of_view, of_point, colors, spread, brightest, positions, footprints = map(
+    of_view, of_point, colors, spread, brightest, contrast, positions, footprints = map(
         np.concatenate, zip(*parts, strict=True)
     )
     cameras = [view.camera for view in views]
@@ -210,6 +213,7 @@ def point_colors(
         names=tuple(view.name for view in views),
         positions=positions,
         brightest=brightest,
+        contrast=contrast,
         camera_names=tuple(sorted(set(cameras))),
         cells=_cells(surfaces.points, of_point, of_view, views),
         footprints=footprints,
