@@ -78,7 +78,7 @@ class Observations:
         mean, apart = srgb_decode(self.colors), np.minimum(self.contrast, 0.9)
         both = [srgb_encode(np.minimum(mean * (1 + s * apart), 1.0)) for s in (-1, 1)]
         cameras = self.cameras[self.views]
-        low, high = (log_exposed(np.float64(y), response, cameras)[0] for y in both)
+        low, high = (log_exposed(y.astype(np.float64), response, cameras)[0] for y in both)
         wanted, y = np.logaddexp(low, high) - np.log(2), np.asarray(self.colors, np.float64)
         for _ in range(NEWTON_STEPS):
             z, slope = log_exposed(y, response, cameras)

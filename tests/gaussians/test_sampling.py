@@ -192,10 +192,12 @@ def test_samples_sit_at_pixel_centres():
     light = 0.2 + 0.8 * (xy[:, 0] - 0.5) / 49
     # `spread` is the change over half a pixel, on a ramp of 0.8/49 per pixel.
     slope = (srgb_encode(light + 1e-4) - srgb_encode(light - 1e-4)) / 2e-4
-    colors, spread, _, valid = sample(image, np.ones((40, 50), np.float32), xy)
+    colors, spread, _, contrast, valid = sample(image, np.ones((40, 50), np.float32), xy)
     assert valid.all()
     np.testing.assert_allclose(colors[:, 0], srgb_encode(light), atol=2e-4)
     np.testing.assert_allclose(spread[:, 0], 0.5 * slope * 0.8 / 49, rtol=5e-3)
+    # Three samples lie one pixel apart.
+    np.testing.assert_allclose(contrast[:, 0], (2 / 3) ** 0.5 * 0.8 / 49 / light, rtol=5e-3)
 
 
 def test_samples_outside_and_masked_and_at_the_border_are_invalid():

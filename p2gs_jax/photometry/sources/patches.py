@@ -14,7 +14,7 @@ averages includes the blur of pixels and of interpolation.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -55,7 +55,8 @@ def surfaces_of(points: Float[np.ndarray, "p 3"], rows: Int[np.ndarray, " n"]) -
     where = np.asarray(points, np.float64)
     normals = np.full((len(where), 3), np.nan)
     if len(where) >= NEIGHBOURS and len(rows):
-        near = KDTree(where).query(where[rows], min(SOME, len(where)), workers=-1)[1]
+        found: Any = KDTree(where).query(where[rows], min(SOME, len(where)), workers=-1)
+        near = found[1]
         first = near[:, :NEIGHBOURS]
         normals[rows] = _flattest(where[first], np.ones(first.shape))
         left = np.flatnonzero(np.isnan(normals[rows, 0]))
