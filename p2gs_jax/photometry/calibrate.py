@@ -205,7 +205,7 @@ def _fixed(
         free = free or fitted is not None
         curve = _under_itself(few, options, form, fitted or base)
     notes = (*_notes(problem, free=free), *collapsed)
-    return Selection(_solved(observations, options, form, curve), (), notes)
+    return Selection(_solved(problem, options, form, curve), (), notes)
 
 
 def _under_itself(
@@ -220,9 +220,12 @@ def _under_itself(
 
 
 def _solved(
-    observations: Observations, options: CalibrationOptions, form: Form, response: Response
+    problem: Problem, options: CalibrationOptions, form: Form, response: Response
 ) -> PhotometricSolution:
-    return fit_model(options.problem(observations.averaged(response)), form, response)
+    averaged = problem.observations.averaged(response)
+    if averaged is not problem.observations:
+        problem = options.problem(averaged)
+    return fit_model(problem, form, response)
 
 
 def _by_one_response(problem: Problem) -> Selection:
@@ -318,7 +321,7 @@ def _chosen(
             f"{MOST_ROUNDS} rounds; their state after these rounds was compared."
         )
     response = _under_itself(few, used, chosen.form, chosen.response)
-    solution = _solved(observations, options, chosen.form, response)
+    solution = _solved(problem, options, chosen.form, response)
     return Selection(solution, tuple(candidates), (*notes, *_reasons(chosen, candidates)))
 
 
