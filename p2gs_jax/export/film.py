@@ -134,8 +134,8 @@ def squared_radii(view: View, height: int, width: int) -> Float32[np.ndarray, "h
     straight = undistort_points(nodes, view.K, view.distortion)
     squared = (formation.places(straight, view.width, view.height) ** 2).sum(-1)
     known = np.where(np.isfinite(squared), np.minimum(squared, 1), 1).astype(np.float32)
-    rows = _interpolated(known.reshape(_INTERVALS + 1, -1), height)
-    return _interpolated(rows.T, width).T
+    columns = _interpolated(known.reshape(_INTERVALS + 1, -1).T, width)
+    return _interpolated(np.ascontiguousarray(columns.T), height)
 
 
 def _interpolated(nodes: Float32[np.ndarray, "n k"], size: int) -> Float32[np.ndarray, "s k"]:

@@ -44,8 +44,7 @@ JUDGED = 0.05  # least share of observations that are held out and have a partne
 # Candidates are compared on at most this many observations; the choice is solved on all.
 MOST_OBSERVATIONS = 40_000
 SPLINE_OBSERVATIONS = 12_000  # a curve has few parameters, and its basis is the most expensive
-
-AVERAGED = 2  # times that a curve is fitted to means of light under itself
+AVERAGED = 2  # times that a curve is fitted again, to means of light under itself
 
 OnChosen = Callable[[Form, Response], None]
 # Beginning of the note with the numbers of a choice. A gain from CLEARLY on, nat, counts as clear.
@@ -211,7 +210,7 @@ def _fixed(
 def _under_itself(
     few: Problem, options: CalibrationOptions, form: Form, response: Response
 ) -> Response:
-    """Return a curve, fitted again to means of light under itself if it has a spline."""
+    """Return a response; its spline, if any, is fitted again to means of light under itself."""
     how = {"form": form._replace(model="view_exposure"), "by": response.by}
     for _ in range(AVERAGED if response.spline else 0):
         again = options.problem(few.observations.averaged(response))

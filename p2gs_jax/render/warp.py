@@ -97,6 +97,6 @@ def warp(
 
 def sample_bilinear(image: Float[Array, "h w c"], xy: Float[Array, "*n 2"]) -> Float[Array, "*n c"]:
     """Return the image at pixel positions (centres at +0.5), clamped to the border."""
-    rows = [xy[..., 1] - 0.5, xy[..., 0] - 0.5]
-    channel = partial(map_coordinates, coordinates=rows, order=1, mode="nearest")
+    row_and_column = [xy[..., 1] - 0.5, xy[..., 0] - 0.5]
+    channel = partial(map_coordinates, coordinates=row_and_column, order=1, mode="nearest")
     return jax.vmap(channel, -1, -1)(image)

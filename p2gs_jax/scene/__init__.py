@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 from p2gs_jax.config import DataConfig, FitConfig
+from p2gs_jax.core.text import first_few
 from p2gs_jax.errors import UserError, broken
 from p2gs_jax.options import check_values
 from p2gs_jax.scene import transforms
@@ -17,7 +19,7 @@ from p2gs_jax.scene.convert.readers import exif_evs
 from p2gs_jax.scene.drives import read_drive
 from p2gs_jax.scene.drives.assemble import assemble
 from p2gs_jax.scene.drives.recording import Recording
-from p2gs_jax.scene.files import Report, is_panorama, list_images, map_notes
+from p2gs_jax.scene.files import Report, images_and_maps, is_panorama, list_images
 from p2gs_jax.scene.hdr_sets import exposure_times, with_all_exposures, with_raw_settings
 from p2gs_jax.scene.masks import attach_masks, image_folder_of, with_alpha
 from p2gs_jax.scene.pixels.store import ImageStore, camera_at, size_at
@@ -53,9 +55,11 @@ def load_scene(
         # This import is local, as the one below: scenes with cameras and points need no COLMAP.
         from p2gs_jax.scene.sfm.map import load_images
 
+        notes: tuple[str, ...] = ()
         if isinstance(found, Path):
             photographs = read_video(found, cfg, work_dir, report)
         else:
+            notes = found.notes
             if work_dir is not None:
                 check_apart(work_dir.parent, found, _searches_below(found.folder, root, cfg))
             photographs = convert_photographs(found.folder, found.paths, work_dir, report)
@@ -63,8 +67,7 @@ def load_scene(
         auto = "sequence" if isinstance(found, Path) else "auto"
         scene = load_images(Path(root), folder, paths, cfg, work_dir, report, auto)
         scene = with_originals(scene, photographs)
-        if isinstance(found, PhotographsAlone):
-            scene = dataclasses.replace(scene, notes=(*scene.notes, *found.notes))
+        scene = dataclasses.replace(scene, notes=(*scene.notes, *notes))
     else:
         scene = found
     listed = scene.split_by is not None or cfg.split is not None
@@ -111,7 +114,15 @@ class PhotographsAlone(NamedTuple):
 
     folder: Path
     paths: list[Path]
-    notes: tuple[str, ...] = ()
+    maps: Sequence[Path] = ()  # pictures that count as depth maps or normal maps
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """A note on `maps`, if there are any: brackets may be called dark, normal and bright."""
+        names = first_few([path.relative_to(self.folder).as_posix() for path in self.maps])
+        note = f"{len(self.maps)} of the pictures count as depth maps or normal maps by the names "
+        note += f"of their folders: {names}. If they are photographs, rename the folders."
+        return (note,) if self.maps else ()
 
 
 def find_scene(
@@ -197,13 +208,12 @@ def _read_colmap(root: Path, folder: Path, cfg: DataConfig) -> Scene:
 def _photographs_alone(root: Path, cfg: DataConfig) -> PhotographsAlone:
     folders = [root / cfg.images] if cfg.images is not None else [root / "images", root]
     for folder in folders:
-        below = _searches_below(folder, root, cfg)
-        paths = list_images(folder, recursive=below)
+        paths, maps = images_and_maps(folder, recursive=_searches_below(folder, root, cfg))
         for path in paths:
             if is_panorama(path):
                 raise broken(path, "shows a whole sphere, and is not a pinhole photograph", CUT)
         if paths:
-            return PhotographsAlone(folder, paths, tuple(map_notes(folder)) if below else ())
+            return PhotographsAlone(folder, paths, maps)
     looked = ", ".join(str(folder) for folder in folders)
     fix = "name the folder that holds one of these"
     film = next((p for p in sorted(root.iterdir()) if p.suffix.lower() in VIDEO_SUFFIXES), None)

@@ -63,23 +63,19 @@ def list_images(folder: Path, *, recursive: bool = True) -> list[Path]:
     Hidden files are left out, and so are masks (in a folder of masks, or named after a photograph),
     depth maps and normal maps. Raises OSError: a folder cannot be read.
     """
-    outside = [p for p in _pictures(folder, recursive) if not _is_in(p, MASK_FOLDERS + MAP_FOLDERS)]
+    return images_and_maps(folder, recursive=recursive)[0]
+
+
+def images_and_maps(folder: Path, *, recursive: bool) -> tuple[list[Path], list[Path]]:
+    """Return the results of `list_images`, and the depth and normal maps that it leaves out."""
+    pictures = _pictures(folder, recursive)
+    maps = [folder / p for p in pictures if _is_in(p, MAP_FOLDERS)]
+    outside = [p for p in pictures if not _is_in(p, MASK_FOLDERS + MAP_FOLDERS)]
     named = {p for p in outside if named_as_mask(p.name)}
     photos = {name_without_mask(p.as_posix()) for p in outside if p not in named}
     masks = {p for p in named if name_without_mask(p.as_posix()) in photos or _always_mask(p.name)}
-    return [folder / p for p in sorted({*outside} - masks, key=lambda p: p.as_posix())]
-
-
-def map_notes(folder: Path) -> list[str]:
-    """Return a note if pictures below a folder are left out as depth maps or normal maps.
-
-    Brackets may have such names: `dark`, `normal` and `bright`.
-    """
-    found = [p for p in _pictures(folder, True) if _is_in(p, MAP_FOLDERS)]
-    names = first_few([path.as_posix() for path in found])
-    note = f"{len(found)} of the pictures count as depth maps or normal maps by the names of their "
-    note += f"folders: {names}. If they are photographs, rename the folders."
-    return [note] if found else []
+    images = [folder / p for p in sorted({*outside} - masks, key=lambda p: p.as_posix())]
+    return images, maps
 
 
 def _pictures(folder: Path, recursive: bool) -> list[Path]:

@@ -165,10 +165,8 @@ def test_vignetting_follows_the_lens(tmp_path, k1):
     straight = np.linspace(0, 1.2, 4000)
     ray = np.interp(np.hypot(x, y), straight * (1 + k1 * straight**2), straight)
     places = np.stack([x, y], -1) * (ray / np.hypot(x, y) * 90 / np.hypot(56, 50))[..., None]
-    grey, capture = (
-        np.full((100, 112, 3), 0.3, np.float32),
-        on_host(Capture, np.float32(1), np.float32(2.2), None, np.int32(0)),
-    )
+    grey = np.full((100, 112, 3), 0.3, np.float32)
+    capture = on_host(Capture, np.float32(1), np.float32(2.2), None, np.int32(0))
 
     def write(path, _):
         shown = formation(grey, capture, cfg, positions=places.astype(np.float32))

@@ -160,7 +160,7 @@ def test_means_are_those_of_light_under_the_response(response):
     np.testing.assert_allclose(log_exposed(found, response)[0], wanted, atol=1e-4)
 
 
-def test_exposures_do_not_drift_along_a_road_under_a_filmic_curve(road):
+def test_exposures_do_not_drift_along_a_road_under_a_filmic_curve():
     """Patches are averaged as if photographs were sRGB, before the curve is known."""
 
     class Film(Road):

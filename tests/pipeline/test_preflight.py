@@ -28,6 +28,7 @@ from p2gs_jax.run.checkpoint import CheckpointStore
 from p2gs_jax.run.decisions import KEY, Decisions, kept_choice
 from p2gs_jax.run.folder import RunFolder
 from p2gs_jax.run.write import write_start
+from p2gs_jax.scene.files import recognition_key
 from p2gs_jax.scene.pixels import cache, store
 
 
@@ -98,6 +99,16 @@ def test_a_run_is_not_continued_with_other_inputs(finished_run, tmp_path, refuse
     text = refused("fit", scene, "--out", run, *FIT, "--steps", "70", "--resume")
     assert "begun with other photographs" in text
     assert files == {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
+
+
+def test_a_run_is_recognised_by_the_content_of_its_known_exposures(tmp_path):
+    listed = tmp_path / "known.csv"
+    keys = [recognition_key((), None)]
+    for value in ("0", "1", "0"):
+        listed.write_text(f"image,ev\n1.png,{value}\n")
+        keys.append(recognition_key((), str(listed)))
+    assert keys[1] == keys[3]
+    assert len(set(keys)) == 3
 
 
 @pytest.mark.parametrize("checkpoint", [False, True])

@@ -2,9 +2,10 @@
 
 The blocks at a boundary render the same views. The median difference is a step; the rest is the
 difference between any two fits. Steps of up to 0.04 stop come from the fits, not from the common
-exposures: each errs by about 0.01 stop, however long (experiments/results/2026-11-23-districts.md).
-A step is distributed over both blocks with weights that fall inwards, like the levelling of texture
-seams (Lempitsky and Ivanov 2007; Waechter et al. 2014). docs/scaling.md describes the limits.
+exposures: each fit errs by about 0.01 stop, and so do long ones
+(experiments/results/2026-11-23-districts.md). A step is distributed over both blocks with weights
+that fall inwards, like the levelling of texture seams (Lempitsky and Ivanov 2007; Waechter et al.
+2014). docs/scaling.md describes the limits.
 """
 
 from __future__ import annotations

@@ -31,9 +31,9 @@ BLUR = 1 / 12 + 1 / 6
 # Number of points that define a normal, with the point itself, and their largest extent across the
 # plane as a share of the smaller extent along it.
 NEIGHBOURS, FLAT = 9, 0.25
-# Where those do not lie on a plane, at least half of SOME points must: within NEAR of their median
-# distance. Planes are tried through the point and two others, in directions APART radians apart.
-SOME, NEAR, APART = 24, 0.1, 0.3
+# Where they do not lie on a plane, at least half of WIDER points must: within NEAR of their median
+# distance. Planes are tried through the point and two others, at least APART radians apart.
+WIDER, NEAR, APART = 24, 0.1, 0.3
 # Number of points whose planes are tried at a time.
 _AT_A_TIME = 512
 # Largest spacing of samples along an axis of a patch, pixels, and numbers of samples.
@@ -55,7 +55,7 @@ def surfaces_of(points: Float[np.ndarray, "p 3"], rows: Int[np.ndarray, " n"]) -
     where = np.asarray(points, np.float64)
     normals = np.full((len(where), 3), np.nan)
     if len(where) >= NEIGHBOURS and len(rows):
-        found: Any = KDTree(where).query(where[rows], min(SOME, len(where)), workers=-1)
+        found: Any = KDTree(where).query(where[rows], min(WIDER, len(where)), workers=-1)
         near = found[1]
         first = near[:, :NEIGHBOURS]
         normals[rows] = _flattest(where[first], np.ones(first.shape))
@@ -85,6 +85,7 @@ def _commonest(around: Float[np.ndarray, "p k 3"]) -> Float[np.ndarray, "p 3"]:
     """
     others = around[:, 1:] - around[:, :1]
     distance = np.linalg.norm(others, axis=2)
+    # Pairs of every second point: all pairs find no better planes, and take four times as long.
     i, j = 2 * np.stack(np.triu_indices((others.shape[1] + 1) // 2, 1))
     normals = np.cross(others[:, i], others[:, j])
     area = np.linalg.norm(normals, axis=2)

@@ -268,8 +268,8 @@ def read_exr(path: Path) -> Picture:
     """Return the light of an OpenEXR: channels R, G, B (even in a layer) or Y.
 
     Colours are converted from the header's chromaticities, and divided by their alpha (A). Raises
-    UserError: the file is not a readable OpenEXR, has no such channels, or several layers of them
-    and none is called as the picture usually is; or its pixels do not cover exactly its frame.
+    UserError: the file is not a readable OpenEXR; it has no such channels, or several layers of
+    them, of which not exactly one has a name in `_PICTURES`; or it has a crop or overscan.
     """
     with _exr(path, separate_channels=True) as file:
         channels: dict[str, Any] = {k: c.pixels for k, c in file.channels().items()}
@@ -339,7 +339,7 @@ def size_of(path: Path) -> tuple[int, int] | None:
 
 
 def _exr_size(path: Path, header: dict) -> tuple[int, int]:
-    """Return width and height; UserError: the pixels do not cover exactly the frame."""
+    """Return width and height; UserError: the file has a crop or overscan."""
     sizes = {}
     for name in ("dataWindow", "displayWindow"):
         low, high = header[name]
