@@ -143,19 +143,15 @@ def radiance_preactivation(radiance: Values, kind: RadianceKind) -> Values:
 
 
 def scaled(
-    sh: Float[np.ndarray, "n k 3"], log_factors: Float[np.ndarray, "..."], kind: RadianceKind
+    sh: Float[np.ndarray, "n k 3"], log_factors: Float[np.ndarray, " 3"], kind: RadianceKind
 ) -> Float[np.ndarray, "n k 3"]:
-    """Return coefficients whose radiance is multiplied by factors, exactly.
-
-    `log_factors` are the natural logarithms of the factors: per channel (3,), per Gaussian (n, 1),
-    or both (n, 3).
-    """
+    """Return coefficients whose radiance is multiplied by exp(`log_factors`), exactly."""
     sh = np.array(sh)
     if kind == "exp":
         sh[:, 0] += log_factors / C0
     else:
         # radiance = value + 1/2, so the constant 1/2 must be scaled, too.
         factors = np.exp(log_factors)
-        sh *= np.expand_dims(factors, -2)
+        sh *= factors
         sh[:, 0] += (factors - 1) * 0.5 / C0
     return sh

@@ -9,7 +9,16 @@ from hypothesis import strategies as st
 
 from p2gs_jax.errors import UserError
 from p2gs_jax.gaussians.seeds import camera_centers
-from p2gs_jax.jobs.blocks.cut import block_scene, cut_scene, seen_points, split, thinned
+from p2gs_jax.jobs.blocks.cut import (
+    Block,
+    Cut,
+    Ground,
+    block_scene,
+    cut_scene,
+    seen_points,
+    split,
+    thinned,
+)
 from p2gs_jax.types import Scene, Tracks, View
 
 LENGTH = 100.0
@@ -88,6 +97,13 @@ def test_blocks_of_a_road_follow_it(tracks, turned):
     assert max(sizes) <= 1.5 * min(sizes)
     names = {scene.training_views[k].name for block in cut.blocks for k in block.views}
     assert names == {view.name for view in scene.training_views}
+
+
+def test_blocks_that_touch_in_a_corner_are_neighbours():
+    ranges = (-np.inf, 0.0), (0.0, np.inf)
+    blocks = [Block((u[0], v[0]), (u[1], v[1])) for u in ranges for v in ranges]
+    cut = Cut(Ground(np.zeros(3), np.eye(3)[:2]), 1.0, tuple(blocks))
+    assert cut.neighbours() == [(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)]
 
 
 def test_too_many_blocks_are_refused_with_the_largest_number():

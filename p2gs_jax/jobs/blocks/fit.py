@@ -23,7 +23,7 @@ from p2gs_jax.formats.ply import read_ply
 from p2gs_jax.jobs.blocks import plan, shared
 from p2gs_jax.jobs.blocks.block import block_job
 from p2gs_jax.jobs.blocks.cut import Cut, cut_scene
-from p2gs_jax.jobs.blocks.seams import Seam, level_seams, merge_cores
+from p2gs_jax.jobs.blocks.seams import Seam, measure_seams, merge_cores
 from p2gs_jax.jobs.engines import LOCAL, check_engine, open_engine
 from p2gs_jax.jobs.job import JobState
 from p2gs_jax.jobs.run import run_jobs
@@ -174,7 +174,7 @@ class _Blocks:
             read_ply(RunFolder(self.blocks / str(k)).radiance) for k in range(len(self.cut.blocks))
         ]
         with self.clock("seams"):
-            fitted, seams = level_seams(solved.scene, store, self.cut, fitted, cfg.render)
+            seams = measure_seams(solved.scene, store, self.cut, fitted, cfg.render)
         gaussians, counts = merge_cores(self.cut, fitted)
         fitted.clear()
         photometry = jax.tree.map(on_device, solved.exposures.photometry)

@@ -1,17 +1,14 @@
-"""Seams between blocks: differences of radiance and depth, their correction, and the merged scene.
+"""Seams between blocks: differences of radiance and depth, and the merged scene.
 
 The blocks at a boundary render the same views. The median difference is a step; the rest is the
-difference between any two fits. Steps of up to 0.04 stop come from the fits, not from the common
-exposures: each fit errs by about 0.01 stop, and so do long ones
-(experiments/results/2026-11-23-districts.md). A step is distributed over both blocks with weights
-that fall inwards, like the levelling of texture seams (Lempitsky and Ivanov 2007; Waechter et al.
-2014). docs/scaling.md describes the limits.
+difference between any two fits. Steps are up to 0.004 stop (experiments/results/
+2026-11-23-districts.md).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import partial
 
 import jax
@@ -21,9 +18,8 @@ from jaxtyping import Float
 from p2gs_jax.config import RenderConfig
 from p2gs_jax.core.numerics import evenly_spaced, on_device
 from p2gs_jax.errors import UserError
-from p2gs_jax.jobs.blocks.cut import OVERLAP, Cut
+from p2gs_jax.jobs.blocks.cut import Cut
 from p2gs_jax.render.capacity import make_renderer
-from p2gs_jax.render.harmonics import scaled
 from p2gs_jax.render.warp import unproject
 from p2gs_jax.scene.pixels.store import ImageStore, camera_of
 from p2gs_jax.types import Camera, Gaussians, Render, Scene
@@ -33,8 +29,6 @@ MOST_VIEWS = 48
 # Pixels are compared where both blocks have at least this opacity.
 OPAQUE = 0.9
 DARKEST = 1e-3  # linear radiance; darker pixels count as this
-# Depth to which the radiance of a core is corrected, as a share of the shortest core.
-INWARDS = 0.5
 # A view with fewer pixels of the strip is ignored.
 FEWEST_PIXELS = 50
 
@@ -53,7 +47,6 @@ class Seam:
     spread_stops: float | None = None  # median absolute value of that ratio, stops
     step_depth: float | None = None  # median ratio of depth, second to first, minus 1
     spread_depth: float | None = None  # median absolute value of that difference
-    levelled_stops: float | None = None  # the step that was removed, measured in other views
 
 
 def measure_seams(
@@ -62,17 +55,16 @@ def measure_seams(
     cut: Cut,
     fitted: Sequence[Gaussians],
     cfg: RenderConfig,
-    which: slice,
 ) -> list[Seam]:
     """Compare neighbouring blocks, with all Gaussians of each, in their common training views.
 
-    Only the cameras of the photographs are used. `which` selects from the common views of two
-    blocks in the order of the scene.
+    Only the cameras of the photographs are used. Radiance is compared as rendered: divided by the
+    opacity, a block that shows 1 % of the background would look 0.014 stop brighter.
     """
     seams = []
     for pair in cut.neighbours():
         first, second = (cut.blocks[k] for k in pair)
-        both = sorted(set(first.views) & set(second.views))[which]
+        both = sorted(set(first.views) & set(second.views))
         fits = [fitted[k] for k in pair]
         renderers = [partial(make_renderer(cfg), g, jax.numpy.ones(g.capacity, bool)) for g in fits]
         rows = (scene.train_indices[both[k]] for k in evenly_spaced(len(both), MOST_VIEWS))
@@ -96,8 +88,8 @@ def _compared(
         drawn = render(camera)
         linear, alpha = np.asarray(drawn.linear), np.asarray(drawn.alpha)
         assert drawn.depth is not None
-        opaque = np.maximum(alpha, 1e-6)
-        renders.append((linear.mean(-1) / opaque, np.asarray(drawn.depth) / opaque, alpha))
+        depth = np.asarray(drawn.depth) / np.maximum(alpha, 1e-6)
+        renders.append((linear.mean(-1), depth, alpha))
     (radiance, depth, alpha), (other, other_depth, other_alpha) = renders
     # A choice by one of the two depths would favour pixels in which that depth is wrong.
     middle = np.sqrt(np.maximum(depth * other_depth, 0.0))
@@ -110,52 +102,6 @@ def _compared(
     good &= (depth > 0) & (other_depth > 0)
     ratio = np.log2(np.maximum(other[good], DARKEST) / np.maximum(radiance[good], DARKEST))
     return ratio, other_depth[good] / depth[good] - 1
-
-
-def level_seams(
-    scene: Scene, store: ImageStore, cut: Cut, fitted: Sequence[Gaussians], cfg: RenderConfig
-) -> tuple[list[Gaussians], list[Seam]]:
-    """Remove the steps between blocks; return their Gaussians, and the seams after the correction.
-
-    Every second view of a boundary measures the step, and the other views measure the remaining
-    seam. `measure_seams` describes the arguments.
-    """
-    before = measure_seams(scene, store, cut, fitted, cfg, slice(0, None, 2))
-    steps = {s.blocks: s.step_stops for s in before if s.step_stops is not None}
-    levelled = []
-    for number, gaussians in enumerate(fitted):
-        shift = shifts(cut, number, np.asarray(gaussians.means), steps) * np.log(2)
-        sh = scaled(np.asarray(gaussians.sh), shift[:, None], cfg.radiance)
-        levelled.append(replace(gaussians, sh=on_device(sh)))
-    after = measure_seams(scene, store, cut, levelled, cfg, slice(1, None, 2))
-    return levelled, [replace(s, levelled_stops=steps.get(s.blocks)) for s in after]
-
-
-def shifts(
-    cut: Cut, number: int, means: Float[np.ndarray, "n 3"], steps: Mapping[tuple[int, int], float]
-) -> Float[np.ndarray, " n"]:
-    """Return the correction of a block's radiance at `means` (scene units), stops.
-
-    Near several blocks the radiance becomes the weighted mean of theirs, with weights that fall
-    with the distance from their cores. Two blocks then agree wherever no third one is near, and
-    far from other blocks the radiance stays. `steps` are ratios of the second block to the first,
-    stops; pairs without a step do not influence each other.
-    """
-    places = cut.ground.place(means)
-    reach = INWARDS * cut.margin / OVERLAP
-    weight = _weight(cut.blocks[number].distance(places), reach)
-    total, moved = weight.copy(), np.zeros(len(places))
-    for (first, second), step in steps.items():
-        if number in (first, second):
-            other, more = (second, step) if number == first else (first, -step)
-            weight = _weight(cut.blocks[other].distance(places), reach)
-            total += weight
-            moved += weight * more
-    return moved / np.maximum(total, np.finfo(float).tiny)
-
-
-def _weight(distance: Float[np.ndarray, " n"], reach: float) -> Float[np.ndarray, " n"]:
-    return np.maximum(1 - distance / reach, 0.0)
 
 
 def merge_cores(cut: Cut, fitted: Sequence[Gaussians]) -> tuple[Gaussians, list[int]]:
