@@ -115,13 +115,14 @@ def _judged(
 
     programs = {}
     for label, renders in others.items():
-        names = [judge.scene.views[row].name for row in sorted(renders.files)]
+        scores = judge_renders(renders, judge, on_progress)
+        names = list(scores["as_rendered"]["per_view"])
         programs[label] = {
             "folder": str(renders.folder),
             "layout": renders.layout,
             "views": len(names),
             "missing": list(renders.missing),
-            **judge_renders(renders, judge, on_progress),
+            **scores,
             "run": scores_of_run(metrics, names),
         }
     return {"version": 1, "programs": programs}

@@ -259,13 +259,16 @@ class Calibrate:
 
     def checked(self) -> FitConfig:
         """Return the configuration; raise a UserError if a value is not valid."""
+        from p2gs_jax.run.decisions import CHOSEN
+
         scene, is_run, cfg = self.scene, self.is_run, self.config
         given, usual = (flat(to_dict(c)) for c in (cfg, preset(self.preset)))
         whole = ("data.test_every", "data.split", "data.max_width", "data.cache_mb")
-        of_stack = "--static reads all photographs of the folder, and finds their limits"
+        of_stack = "--static reads all photographs of the folder, and finds limits, model and curve"
+        chosen = ("data.", "loss.", "photometry.pivot", *(f"photometry.{name}" for name in CHOSEN))
         of_run = f"{scene} is a finished run, which keeps its photographs, limits and seed"
         for applies, why, unread in (
-            (self.static, of_stack, ("data.", "loss.", "photometry.pivot")),
+            (self.static, of_stack, chosen),
             (is_run, of_run, ("data.", "loss.", "train.seed")),
             (True, "every photograph is calibrated, and read once at its full size", whole),
         ):

@@ -150,20 +150,20 @@ def panoramas_of(options: Render, fitted: Run) -> Job:
     if options.width is not None:
         cylinder = cylinder.resized(options.width)
     notes = []
+    allowed = {shot.view for shot in _chosen(options, fitted)}
+    shown = [s for s in rig.steps if any(shot.view in allowed for shot in s.shots.values())]
     if options.trajectory == "drive":
-        if len(rig.steps) < 2:
-            fix = "use --trajectory views"
-            raise UserError("A drive needs at least two time steps; the rig has one.", fix=fix)
-        path = PosePath(rig.poses)
+        if len(shown) < 2:
+            why = f"A drive needs two time steps; --split {options.split} has {len(shown)}."
+            raise UserError(why, fix="use --trajectory views, or another --split")
+        path = PosePath(np.stack([step.pose for step in shown]))
         along = path.evenly(options.frames)
         poses = path(along)
-        times = interpolated(path.times, [step.time for step in rig.steps], along)
+        times = interpolated(path.times, [step.time for step in shown], along)
         if options.shift is not None:
             poses = beside(poses, views, options.shift)
         steps = list(zip([f"{k:05d}" for k in range(len(poses))], poses, times, strict=True))
     else:
-        allowed = {shot.view for shot in _chosen(options, fitted)}
-        shown = [s for s in rig.steps if any(shot.view in allowed for shot in s.shots.values())]
         if not shown:
             raise UserError(f"The rig has no time step of --split {options.split}.")
         steps = [(step.name, step.pose, step.time) for step in shown]

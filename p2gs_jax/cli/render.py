@@ -132,7 +132,8 @@ def _load(options: Render) -> Run:
     if options.white_balance_of is not None:
         fitted.white_balance_of(options.white_balance_of)
     p = fitted.cfg.photometry
-    bare = not any(camera.vignetting for camera in p.cameras) and p.appearance is None
+    learned = p.appearance in ("bilateral", "ppisp")
+    bare = not (learned or any(camera.vignetting for camera in p.cameras))
     why = f"{fitted.folder} has no vignetting that --no-vignetting could leave out"
     check(not (options.no_vignetting and bare), why, fix="leave the option out")
     if options.without_objects:

@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from p2gs_jax.core.threads import map_in_order
+from p2gs_jax.errors import UserError
 from p2gs_jax.evaluation.alignment import with_fitted_exposure
 from p2gs_jax.evaluation.evaluate import Judge
 from p2gs_jax.evaluation.renders_of_others import OtherRenders, Rendered
@@ -43,8 +44,8 @@ def judge_renders(
     """Return the scores of renders of held-out views; `found` comes from `check_renders`.
 
     They are `as_rendered` and `exposure_fitted`, as the protocols of `metrics.json`; with reference
-    photographs also `reference` with `as_rendered` and `scale_aligned`. Raises UserError: see
-    `OtherRenders.read`.
+    photographs also `reference` with `as_rendered` and `scale_aligned`. Views that masks hide are
+    left out. Raises UserError: masks hide all views, or see `OtherRenders.read`.
     """
 
     def light(row: int, shown: DisplayTransform) -> Light:
@@ -63,7 +64,10 @@ def judge_renders(
         ldr = develop(linear, fitted, alpha=alpha)
         return score(picture), {**score(ldr), "exposure": fitted.exposure}
 
-    rows = sorted(found.files)
+    rows = [row for row in sorted(found.files) if judge.store.get(row)[1].any()]
+    if not rows:
+        why = "masks hide every held-out view that was to be compared."
+        raise UserError(why, fix="render other views, or leave out --against")
     as_rendered, exposure_fitted = {}, {}
     for done, (row, (plain, fitted)) in enumerate(
         zip(rows, map_in_order(judged, rows), strict=True), 1

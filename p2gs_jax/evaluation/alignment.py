@@ -102,9 +102,9 @@ def fit_exposure(
 ) -> Float[Array, ""]:
     """Return the exposure with which a render fits a photograph best, in squared LDR error.
 
-    A coarse search over +-12 stops around 1 precedes a golden-section search: clipped images give
-    the error flat stretches, where Newton's method stalls. The exposure of `capture` is ignored;
-    `matte` is the background of render and photograph.
+    A coarse search over +-12 stops around the exposure of `capture` precedes a golden-section
+    search: clipped images give the error flat stretches, where Newton's method stalls. `matte` is
+    the background of render and photograph.
     """
     # Imported here, because it is slow to load and rarely needed.
     import optimistix
@@ -120,7 +120,7 @@ def fit_exposure(
         squared = mask[every][..., None] * (ldr - photograph[every]) ** 2
         return jnp.sum(squared) / jnp.maximum(jnp.sum(mask), 1)
 
-    grid = jnp.linspace(-SEARCH_STOPS, SEARCH_STOPS, SEARCH_STEPS)
+    grid = jnp.linspace(-SEARCH_STOPS, SEARCH_STOPS, SEARCH_STEPS) + jnp.log2(capture.exposure)
     best = grid[jnp.argmin(lax.map(functools.partial(error, stride=SEARCH_STRIDE), grid))]
     width = 2 * SEARCH_STOPS / (SEARCH_STEPS - 1)
     # The bracket begins at zero: optimistix 0.1.0 places its first inner point correctly only then.

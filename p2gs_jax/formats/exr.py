@@ -21,7 +21,9 @@ from p2gs_jax.scene.convert.icc import BT709
 from p2gs_jax.scene.convert.readers import ExifSettings
 from p2gs_jax.types import Camera
 
-HALF_MAX = 65504.0  # largest finite 16-bit float
+# Least normal and largest finite 16-bit float.
+HALF_MIN, HALF_MAX = 2.0**-14, 65504.0
+DIM = 0.01  # largest share of positive values below `HALF_MIN` in 16-bit floats
 
 
 def write_exr(
@@ -37,12 +39,15 @@ def write_exr(
 ) -> None:
     """Write linear radiance, without exposure applied; docs/exports.md lists the header.
 
-    Colours and `alpha` (channel A) are 16-bit floats, unless a colour would overflow.
+    Colours and `alpha` (channel A) are 16-bit floats, unless a colour would overflow or 1 % of the
+    colours would lose digits.
     `depth` is camera z times alpha; channel Z holds expected depth as 32-bit floats. The header
     describes `transform`, `camera` and the EXIF settings `shot`.
     """
     linear = np.asarray(linear, np.float32)
-    pixel = np.float16 if np.all(np.abs(linear) <= HALF_MAX) else np.float32
+    light = linear[linear > 0]
+    fits = np.all(np.abs(linear) <= HALF_MAX) and np.mean(light < HALF_MIN) <= DIM
+    pixel = np.float16 if fits or not light.size else np.float32
     header: dict = {
         "compression": OpenEXR.ZIP_COMPRESSION,
         "type": OpenEXR.scanlineimage,

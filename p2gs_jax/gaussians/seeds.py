@@ -24,7 +24,8 @@ from p2gs_jax.types import Gaussians, Photometry, Scene, View
 NEIGHBOURS = 3  # number of neighbours that give a scale (3DGS)
 # 3DGS: the scene extent is 1.1 times the radius of the camera centres.
 EXTENT_MARGIN = 1.1
-MIN_RADIANCE = 1e-3  # in the gauge of the exposures
+# Least radiance of a seed, as a share of bright ones (QUANTILE): exposures may have any unit.
+MIN_RADIANCE, QUANTILE = 2e-3, 0.9
 # At most the share FEW of the cameras (at least one) counts as misplaced; the nearest of these is
 # FARTHER times as far away as every other camera and as the median point.
 FEW, FARTHER = 0.05, 20.0
@@ -145,9 +146,9 @@ def gaussians_from_points(
     scales = neighbour_scales(points, views) if scales is None else np.asarray(scales)
     axes = np.broadcast_to(scales if scales.ndim == 2 else scales[:, None], (count, 3))
     start = np.broadcast_to(cfg.init.opacity if opacity is None else opacity, (count,))
-    dc = radiance_preactivation(
-        np.maximum(radiance, MIN_RADIANCE).astype(np.float32), cfg.render.radiance
-    )
+    bright = float(np.quantile(radiance, QUANTILE)) if count else 0.0
+    light = np.maximum(radiance, MIN_RADIANCE * (bright or 1.0)).astype(np.float32)
+    dc = radiance_preactivation(light, cfg.render.radiance)
     sh = np.zeros((count, coefficient_count(cfg.render.sh_degree), 3), np.float32)
     sh[:, 0] = dc / C0
     if quats is None:
@@ -166,13 +167,13 @@ def merge(a: Gaussians, b: Gaussians) -> Gaussians:
     return jax.tree.map(lambda x, y: on_device(np.concatenate([x, y])), a, b)
 
 
-def photographed_radiance(
+def photographed_colors(
     scene: Scene, store: ImageStore, photometry: Photometry, cfg: FitConfig
-) -> Float[np.ndarray, "p 3"]:
-    """Return the mean radiance at the scene's points in the training photographs that see them.
+) -> Scene:
+    """Return a scene whose points have the mean radiance in the training photographs, as sRGB.
 
-    Its gauge is set by the initial exposures. Points that no photograph sees get the median of
-    the other points.
+    The exposure is the geometric mean of the photographs. Points that no photograph sees get the
+    median of the other points.
     """
 
     def seen_in(view: View, row: int):
@@ -180,7 +181,10 @@ def photographed_radiance(
         seen = np.flatnonzero(unoccluded(xy, z, view.width, view.height))
         return seen, xy[seen]
 
-    return mean_radiance(len(scene.points), seen_in, scene, store, photometry, cfg)
+    radiance = mean_radiance(len(scene.points), seen_in, scene, store, photometry, cfg)
+    exposure = np.exp(np.mean(np.asarray(photometry.log_exposures)))
+    encoded = np.asarray(srgb_encode(np.clip(exposure * radiance, 0, 1)))
+    return dataclasses.replace(scene, point_colors=np.rint(255 * encoded).astype(np.uint8))
 
 
 def mean_radiance(
@@ -228,9 +232,3 @@ def photographed(
         place = places(xy[valid], *mask.shape[::-1])
         radiance = inverse_formation(colors, host.capture(row), cfg.photometry, place)
         yield seen[valid], colors, np.asarray(radiance)
-
-
-def with_colors(scene: Scene, radiance: Float[np.ndarray, "p 3"]) -> Scene:
-    """Return the scene with point colours: sRGB of the radiance at exposure 1."""
-    encoded = np.asarray(srgb_encode(np.clip(radiance, 0, 1)))
-    return dataclasses.replace(scene, point_colors=np.rint(255 * encoded).astype(np.uint8))

@@ -156,7 +156,7 @@ def calibrate(
         # Every photograph is read once.
         once = dataclasses.replace(cfg.data, cache_mb=0)
         store = ImageStore(scene.views, once, scene.objects).only_opaque()
-        if not (has_tracks(scene) or len(scene.points)):
+        if scene.random_seeds or not (has_tracks(scene) or len(scene.points)):
             raise UserError(
                 f"{scene_dir} has neither tracks nor points: it is unknown which pixels show the "
                 "same surface.",

@@ -14,6 +14,7 @@ from jaxtyping import Float32
 
 from p2gs_jax.config import FitConfig
 from p2gs_jax.core.progress import Reporter, Silent
+from p2gs_jax.errors import UserError
 from p2gs_jax.photometry import calibrate
 from p2gs_jax.photometry.observations import Observations
 from p2gs_jax.photometry.parameters import initial_photometry
@@ -68,6 +69,10 @@ def solve_exposures(
         if kept is not None:
             selection = dataclasses.replace(selection, reasons=kept.reasons)
         notes += [*selection.reasons, *selection.solution.warnings]
+    elif cfg.photometry.known is not None:
+        why = f"{scene.root}: no point of a surface is seen by two photographs, so the light that "
+        why += "belongs to --known-exposures cannot be found."
+        raise UserError(why, fix="leave the option out, or give a structure-from-motion model")
     decisions = decide(cfg, selection, kept)
     resolved = decisions.resolve(cfg)
     solution = None if selection is None else selection.solution

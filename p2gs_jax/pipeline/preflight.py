@@ -110,6 +110,9 @@ def check_options(cfg: FitConfig) -> None:
     contradicts the curve.
     """
     p, share = cfg.photometry, cfg.densify.spread
+    if cfg.data.split not in (None, EVERY) and not cfg.data.test_every:
+        why = f"--test-every 0 holds out no view, and --split {cfg.data.split} would be ignored."
+        raise UserError(why, fix="leave out one of them")
     curved, random = p.curve != "linear", "--photometry.curve linear --photometry.start random"
     if not 0 <= share < 1:
         why = f"--densify.spread {share:g} is not between 0 and 1 (1 excluded)."
@@ -118,6 +121,12 @@ def check_options(cfg: FitConfig) -> None:
         why = "--photometry.start random, which some presets set, draws initial exposures "
         why += "and would ignore known ones."
         raise UserError(why, fix="leave out --known-exposures, or add --photometry.start tracks")
+    fixed = {"white-balance": p.white_balance == "camera", "vignetting": p.vignetting is not None}
+    fixed["responses"] = p.responses != "all"
+    given = [f"--photometry.{name}" for name, asked in fixed.items() if asked]
+    if given and p.start != "tracks":
+        why = f"{given[0]} has no effect: exposures are learned (--photometry.start random)."
+        raise UserError(why, fix=f"leave out {given[0]}, or add --photometry.start tracks")
     if p.appearance == "ppisp" and curved:
         why = f"ppisp learns a whole camera; it does not combine with curve {p.curve!r}."
         raise UserError(why, fix=f"use --preset ppisp, or add {random}")

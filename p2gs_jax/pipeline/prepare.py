@@ -86,9 +86,7 @@ def initialise(found: Survey, exposures: Exposures, reporter: Reporter | None = 
         covering = np.concatenate([scene.points, added.points])
         shell = find_shell(views, covering, found.radius, found.init, found.sphere)
     if scene.point_colors is None:
-        scene = seeding.with_colors(
-            scene, seeding.photographed_radiance(scene, found.still, photometry, cfg)
-        )
+        scene = seeding.photographed_colors(scene, found.still, photometry, cfg)
     radiance = exposures.radiance
     if radiance is None:
         solution = None if exposures.selection is None else exposures.selection.solution

@@ -166,12 +166,14 @@ def with_choice(decided: Decisions, form: Form, response: Response) -> Decisions
 def unsolved(decided: Decisions) -> Decisions:
     """Return the decisions without a solution: exposures are learned, and start at 1 if not random.
 
-    A white balance per view is learned as well.
+    A white balance per view is learned as well. A spline without values becomes sRGB.
     """
+    lost = decided.curve == "spline" and decided.spline is None
     by_view = decided.white_balance == "view"
     return dataclasses.replace(
         decided,
         start="random",
+        curve="srgb" if lost else decided.curve,
         start_std=decided.start_std if decided.start == "random" else 0.0,
         white_balance="view" if by_view else None,
         vignetting=None,

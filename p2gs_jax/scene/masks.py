@@ -193,4 +193,6 @@ def with_alpha(scene: Scene, cfg: DataConfig) -> Scene:
         "ignore": "it is ignored (--data.alpha ignore)",
     }[cfg.alpha]
     note = f"{sum(found)} of {len(found)} photographs have an alpha channel: {use}."
+    if cfg.alpha != "background" and cfg.background != DataConfig.background:
+        note += f" --background {cfg.background} has no effect."
     return dataclasses.replace(scene, views=views, notes=(*scene.notes, note))

@@ -40,6 +40,7 @@ WRONG = [
     ("calibrate castle --out run --photometry.white-balance view", "add --photometry.no-select"),
     ("fit nowhere --out run --test-every 1", "--test-every"),
     ("fit nowhere --out run --split none.txt", "correct the option --split"),
+    ("fit nowhere --out run --split castle/000.png --test-every 0", "leave out one of them"),
     ("fit nowhere --out run --background puce", "--background 0.5,0.5,0.5"),
     ("fit castle --out run --seed -1", "--seed must be at least 0"),
     ("fit castle --out run --train.log-every 0", "--train.log-every must be at least 1"),
@@ -51,6 +52,10 @@ WRONG = [
     ("fit castle --out run --render.tile 16", "Expected 2 values"),
     ("fit castle --out run --render.background 0.1 nan 0.1", "--render.background"),
     ("fit castle --out run --densify.method mcmcc", "'adaptive'"),
+    *[
+        (f"fit castle --out run --preset paper --photometry.{option}", "--photometry.start tracks")
+        for option in ("vignetting camera", "responses camera", "white-balance camera")
+    ],
     ("fit castle --out run --densify.spread 1", "for example 0.5"),
     ("fit castle --out run --preset bset", "choose paper, paper_appendix, robust"),
     ("fit castle --out run --blocks some", "'some' is not a whole number, and not auto"),
@@ -100,7 +105,10 @@ WRONG = [
     ("demo --out file.txt", "file.txt is a file. To fix it: name a folder with"),
     ("calibrate castle --out begun", "photometry.json would be replaced"),
     ("calibrate castle --out begun --static", "photometry.json would be replaced"),
-    ("calibrate castle --out run --static --photometry.curve power", "--photometry.no-select"),
+    (
+        "calibrate castle --out run --static --photometry.curve power",
+        "leave out --photometry.curve",
+    ),
     ("calibrate castle --out run --static --data.max-width 99", "leave out --data.max-width"),
     ("calibrate castle --out run --static --photometry.pivot 1", "leave out --photometry.pivot"),
     ("calibrate castle --out run --data.test-every 3", "--data.test-every, which would have no"),

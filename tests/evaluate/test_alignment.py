@@ -34,14 +34,16 @@ def light(seed=0):
 
 
 @pytest.mark.parametrize("true", [2.0**-9, 0.4, 20.0, 2.0**9])
+@pytest.mark.parametrize("usual", [1.0, 1e-4, 1e6])
 @pytest.mark.parametrize("curve", ["srgb", "power"])
-def test_fit_exposure_finds_the_exposure(true, curve):
-    """Also with exposures far from 1, and with masked pixels that are saturated."""
+def test_fit_exposure_finds_the_exposure(true, curve, usual):
+    """Also with exposures far from 1 or in other units, and with masked pixels that saturate."""
     cfg, linear = PhotometryConfig(curve=curve), light()
     photo = display(formation(linear, USUAL, cfg)).at[:4].set(1.0)
     mask = jnp.ones((20, 30)).at[:4].set(0.0)
-    found = alignment.fit_exposure(linear / true, photo, mask, USUAL, cfg)
-    assert float(found) == pytest.approx(true, rel=2e-3)
+    start = replace(USUAL, exposure=usual)
+    found = alignment.fit_exposure(linear / true / usual, photo, mask, start, cfg)
+    assert float(found) == pytest.approx(true * usual, rel=2e-3)
 
 
 @pytest.mark.parametrize("before", [None, (0.1, 0.0, -0.1)])

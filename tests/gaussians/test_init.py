@@ -62,6 +62,19 @@ def test_seeds_carry_their_radiance(name):
     assert np.all(np.isfinite(g.log_scales))
 
 
+def test_seeds_do_not_depend_on_the_unit_of_exposures():
+    """Known exposures may be in milliseconds; also the darkest seeds then scale with them."""
+    points = np.random.default_rng(0).normal(0, 1, (100, 3)).astype(np.float32)
+    radiance = np.geomspace(1e-6, 1, 300, dtype=np.float32).reshape(100, 3)
+    values = [
+        seeds.gaussians_from_points(points, k * radiance, [view()], FitConfig()).sh[:, 0]
+        for k in (1.0, 1e-3, 1e3)
+    ]
+    for other in values[1:]:
+        change = np.asarray(other - values[0])
+        assert np.ptp(change) < 1e-4 * abs(change.mean())
+
+
 def test_a_camera_far_from_all_others_counts_for_nothing_and_is_named(tmp_path):
     views = [view(x) for x in (*np.linspace(0, 10, 9), 6e4)]
     points = street_points(ground_only=True)

@@ -334,6 +334,16 @@ def test_without_shared_points_exposures_are_1_and_unknown(model):
         assert np.all(np.isfinite(s.gammas))
 
 
+def test_views_apart_from_known_exposures_have_their_mean():
+    """Known exposures may be in seconds; a black photograph beside them is not at 1 s."""
+    dark = PLAIN.picked(PLAIN.views != 4)
+    known = np.log(ISO4 / 1000)
+    known[4] = np.nan
+    s = adjust(dark, known=KnownExposures(known))
+    assert s.log_exposures[4] == pytest.approx(np.nanmean(known))
+    np.testing.assert_allclose(np.delete(s.log_exposures - known, 4), 0, atol=1e-3)
+
+
 def test_known_exposures_are_kept_and_set_the_gauge():
     truth = 3.7 * ISO4
     known = np.full(len(truth), np.nan)

@@ -18,8 +18,8 @@ from tiny_scene import make_scene, prepared
 import p2gs_jax
 from p2gs_jax import DivergenceError, FitConfig, RenderConfig, UserError, with_fields
 from p2gs_jax.gaussians.population import Coverage
+from p2gs_jax.pipeline import calibrate, preflight
 from p2gs_jax.pipeline import fit as pipeline
-from p2gs_jax.pipeline import preflight
 from p2gs_jax.pipeline.preflight import MemoryNeeded, check_run_dir, memory_needed, require_memory
 from p2gs_jax.pipeline.survey import load
 from p2gs_jax.render import selfcheck
@@ -77,6 +77,18 @@ def test_functions_refuse_what_commands_refuse(tmp_path, scene, command, field, 
     with pytest.raises(UserError) as refused:
         command(scene, tmp_path / "out", with_fields(FitConfig(), {field: value}))
     assert words in str(refused.value)
+
+
+def test_random_seeds_tell_no_exposures(tmp_path, scene, monkeypatch):
+    known = tmp_path / "known.csv"
+    known.write_text("image,exposure\n000.png,1\n")
+    cfg = with_fields(FitConfig(), {"photometry.known": str(known)})
+    found = dataclasses.replace(load(scene, tmp_path, cfg), random_seeds=True)
+    with pytest.raises(UserError, match="--known-exposures cannot be found"):
+        prepared(found, cfg)
+    monkeypatch.setattr(calibrate, "load_scene", lambda *_, **__: found)
+    with pytest.raises(UserError, match="neither tracks nor points"):
+        p2gs_jax.calibrate(scene, tmp_path / "out")
 
 
 @pytest.mark.parametrize("change", ["photograph", "split", "camera"])

@@ -9,6 +9,7 @@ from tiny_scene import make_scene
 
 from p2gs_jax import FitConfig, Params, Photometry, load_run, with_fields
 from p2gs_jax.photometry.formation import corner, squared_radii
+from p2gs_jax.photometry.response import KNOTS
 from p2gs_jax.run.decisions import Decisions, decide, likely, unsolved
 from p2gs_jax.train.optimizer import learning_rates
 from p2gs_jax.train.update import _recentered
@@ -56,6 +57,11 @@ def test_without_solved_exposures_only_white_balance_per_view_remains():
     assert likely(cfg, None, {}) == decided
     by_camera = with_fields(cfg, {"photometry.white_balance": "camera"})
     assert unsolved(Decisions.as_given(by_camera)).white_balance is None
+    # The spline of `ppisp_solved` is solved, too.
+    splined = with_fields(cfg, {"photometry.curve": "spline"})
+    assert unsolved(Decisions.as_given(splined)).curve == "srgb"
+    values = with_fields(splined, {"photometry.spline": (0.0,) * len(KNOTS)})
+    assert unsolved(Decisions.as_given(values)).curve == "spline"
 
 
 def photographed_by_a_camera(root, views=8):

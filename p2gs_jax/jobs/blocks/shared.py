@@ -12,7 +12,7 @@ from p2gs_jax.config import FitConfig
 from p2gs_jax.core.atomic import atomic_write, readable, write_json
 from p2gs_jax.core.progress import Reporter
 from p2gs_jax.errors import UserError
-from p2gs_jax.gaussians.seeds import cameras_radius, photographed_radiance, with_colors
+from p2gs_jax.gaussians.seeds import cameras_radius, photographed_colors
 from p2gs_jax.gaussians.shell import Sphere, sphere_behind
 from p2gs_jax.jobs.blocks.cut import Cut, block_scene
 from p2gs_jax.photometry.parameters import point_radiance
@@ -54,7 +54,7 @@ def solve_shared(
     decisions = dataclasses.replace(solved.decisions, **scale)
     resolved = decisions.resolve(cfg)
     if scene.point_colors is None:
-        scene = with_colors(scene, photographed_radiance(scene, still, solved.photometry, resolved))
+        scene = photographed_colors(scene, still, solved.photometry, resolved)
     exposures = dataclasses.replace(
         solved,
         photometry=jax.tree.map(np.asarray, solved.photometry),

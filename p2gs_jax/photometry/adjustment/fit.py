@@ -115,19 +115,20 @@ def solution_of(
     log_radiance, residual, outliers = explain(fit, problem, response)
     seen = used.any(1)
     per_view = np.bincount(o.views[seen], minlength=o.view_count)
-    active, free = per_view > 0, np.ones(o.view_count, bool)
+    active, free, level = per_view > 0, np.ones(o.view_count, bool), 0.0
     component = problem.tied(MODELS[form.model].exposure)
     if problem.known is not None:
         fixed = np.isfinite(problem.known.log_exposures)
         free = ~np.isin(component, np.unique(component[fixed]))
-        active = active | fixed
-    # Known exposures fix the mean exposure of a component, but not its mean colour.
+        active, level = active | fixed, float(problem.known.log_exposures[fixed].mean())
+    # Known exposures fix the mean exposure of a component, but not its mean colour. Other views
+    # get the mean of the known exposures, whose unit may be a second.
     gauges = _Gauge(component, active & free), _Gauge(problem.tied(form.white_balance), active)
-    exposures, shifts, lost = _exposures(fit, form, covariance, active, *gauges)
+    exposures, shifts, lost = _exposures(fit, form, covariance, active, level * free, *gauges)
     # Radiances of points shift inversely, by the shift of one of their views.
     some_view = np.zeros(o.point_count, int)
     some_view[o.points[seen]] = o.views[seen]
-    view_residual, tint, level = _per_view_ev(o.views, residual, used, o.view_count)
+    view_residual, tint, more_ev = _per_view_ev(o.views, residual, used, o.view_count)
     cameras, corner_errors = _cameras(fit, response, covariance, o)
     part = o.thinned(PER_VIEW, 0)
     solution = PhotometricSolution(
@@ -153,7 +154,7 @@ def solution_of(
     )
     warnings = _warnings(fit, solution, lost, active, o.names)
     if problem.known is not None:
-        warnings += _contradictions(problem.known, solution.exposures_ev + level, o.names)
+        warnings += _contradictions(problem.known, solution.exposures_ev + more_ev, o.names)
     warnings += place_warnings(o.picked(part), residual[part] / LN2, used[part])
     return replace(solution, warnings=tuple(warnings))
 
@@ -163,10 +164,14 @@ def _exposures(
     form: Form,
     covariance: Uncertainty,
     active: Bool[np.ndarray, " v"],
+    level: Float[np.ndarray, " v"],
     scale: _Gauge,
     color: _Gauge,
 ) -> tuple[dict[str, np.ndarray], Float[np.ndarray, "v x"], Bool[np.ndarray, " v"]]:
-    """Return exposures, gammas, white balance and errors; gauge shifts; views without errors."""
+    """Return exposures, gammas, white balance and errors; gauge shifts; views without errors.
+
+    `level` is the mean log exposure of each view's component, or of a view that is not solved.
+    """
     a, light = fit.theta.a, fit.theta.b / fit.theta.a[:, None]
     h, balance = light.mean(1), light - light.mean(1, keepdims=True)
     features, cameras = fit.model.unknowns.features, fit.model.layout.cameras
@@ -180,7 +185,7 @@ def _exposures(
     if features.balance:
         balance = balance + of_cameras(fit.theta.k[:, None])[..., 0]
     balance = np.broadcast_to(balance, (len(h), 3))
-    shift = scale.shift(h)
+    shift = scale.shift(h) - level
     shifts = shift[:, None] + color.shift(balance)
 
     def of_balance(change: Parameters):
@@ -200,7 +205,7 @@ def _exposures(
     solved = active | (MODELS[form.model].exposure == "camera")
     tinted = active | (form.white_balance == "camera")
     found = {
-        "log_exposures": np.where(solved, h - shift, 0.0),
+        "log_exposures": np.where(solved, h - shift, level),
         "exposure_errors": np.where(determined, h_errors, np.inf),
         "gammas": GAMMA_SRGB / a,
         "gamma_errors": np.where(determined, GAMMA_SRGB / a / a * a_errors, np.inf),

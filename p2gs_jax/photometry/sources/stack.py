@@ -55,7 +55,8 @@ class StackColors(NamedTuple):
 def read_stack(folder: Path) -> Stack:
     """Read the photographs of a folder (or of its `images/`).
 
-    Raises UserError: no folder, fewer than two photographs, unreadable ones, or different sizes.
+    Raises UserError: no folder, fewer than two photographs, unreadable ones, different sizes, or
+    photographs that consist of margins.
     """
     if not folder.is_dir():
         raise broken(folder, "is not a folder.", "name the folder of the photographs")
@@ -73,6 +74,9 @@ def read_stack(folder: Path) -> Stack:
         if size != first:
             why = f"has {size} pixels, but {files[0].name} has {first}."
             raise broken(path, why, "give photographs of one size")
+    if min(images[0].shape[:2]) <= 2 * MARGIN:
+        why = f"has a side of {min(images[0].shape[:2])} pixels; {2 * MARGIN + 1} are needed."
+        raise broken(files[0], why, "give larger photographs")
     blue = np.all([(i[..., 2] > 200) & (i[..., 0] < 60) & (i[..., 1] < 60) for i in images], 0)
     grown = cv2.dilate(blue.astype(np.uint8), np.ones((15, 15), np.uint8)) > 0
     pose, K = np.eye(4, dtype=np.float32), np.eye(3, dtype=np.float32)

@@ -55,9 +55,13 @@ def counted(count: int, words: str) -> list[str]:
 def drive_folder(root: Path, wanted: str | None, marker: str) -> Path:
     """Return the folder of a drive: `root`, or the subfolder with the name `wanted`.
 
-    The glob `marker` finds a file in the folder of a drive. UserError: see `chosen_drive`.
+    The glob `marker` finds a file in the folder of a drive. UserError: `root` is another drive, or
+    see `chosen_drive`.
     """
     if any(root.glob(marker)):
+        if wanted is not None and wanted not in root.resolve().name:
+            fix = "leave out --drive, or name the folder of all drives"
+            raise UserError(f"{root} is one drive, and its name has no {wanted!r}.", fix=fix)
         return root
     drives = {path.relative_to(root).parts[0] for path in root.glob(f"*/{marker}")}
     return root / chosen_drive(wanted, sorted(drives), root)

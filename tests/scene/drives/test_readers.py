@@ -92,6 +92,8 @@ def test_one_of_several_drives_has_to_be_named(copied, read, name, part):
         read(first.parent, drive=part[:-1])
     with refused(f"no drive 'other'; there are {part}, {part}_other"):
         read(first.parent, drive="other")
+    with refused(f"{first} is one drive, and its name has no 'other'", "leave out --drive"):
+        read(first, drive="other")
     other = read(first.parent, drive=f"{part}_o")
     assert len(other.photographs) == len(made.photographs)
     assert all(f"{part}_other" in str(p.path) for p in other.photographs)
