@@ -146,6 +146,7 @@ def test_smaller_copies_have_the_exif_of_the_photographs(tmp_path):
         (tmp_path / folder).mkdir(parents=True)
     jpeg_with_exif(tmp_path / "images/cam0/a.jpg", FULL)
     jpeg_with_exif(tmp_path / "images/cam0/b.JPG", {**FULL, ISO: 800})
+    (tmp_path / "images/cam0/b.DNG.xmp").touch()  # a sidecar
     copies = [tmp_path / "images_2/cam0" / name for name in ("a.jpg", "b.png", "c.png")]
     for path in copies:
         Image.new("RGB", (4, 4)).save(path)

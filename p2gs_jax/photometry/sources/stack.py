@@ -15,7 +15,7 @@ from p2gs_jax.errors import broken
 from p2gs_jax.photometry.observations import Observations
 from p2gs_jax.photometry.sources.sampling import sample
 from p2gs_jax.scene.convert.readers import exif_evs
-from p2gs_jax.scene.files import undecodable
+from p2gs_jax.scene.files import IMAGE_SUFFIXES, undecodable
 from p2gs_jax.types import View
 
 POINTS, CANDIDATES = 4000, 40_000  # sampled pixels, and random ones that they are chosen from
@@ -56,12 +56,17 @@ def read_stack(folder: Path) -> Stack:
     """Read the photographs of a folder (or of its `images/`).
 
     Raises UserError: no folder, fewer than two photographs, unreadable ones, different sizes, or
-    photographs that consist of margins.
+    photographs that consist of margins or have a format that is not read here.
     """
     if not folder.is_dir():
         raise broken(folder, "is not a folder.", "name the folder of the photographs")
     inner = folder / "images" if (folder / "images").is_dir() else folder
-    files = sorted(p for p in inner.iterdir() if p.suffix.lower() in SUFFIXES)
+    found = sorted(p for p in inner.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES)
+    files = [p for p in found if p.suffix.lower() in SUFFIXES]
+    # Raw files beside JPEG files of the same names may stay.
+    if others := [p for p in found if p.stem not in {q.stem for q in files}]:
+        fix = "convert it to JPEG, PNG or TIFF, or move it out of the folder"
+        raise broken(others[0], "is a photograph that --static does not read.", fix)
     if len(files) < 2:
         fix = "name a folder of photographs from one viewpoint at several exposures"
         raise broken(inner, f"holds {count_of(len(files), 'photograph')}; a stack needs two.", fix)
