@@ -117,7 +117,8 @@ def dense_seeds(
         affordable = int(DENSE_TIME * cfg.train.budget_s / DENSE_SECONDS)
         most_views = min(most_views, max(affordable, FEWEST_DENSE_VIEWS))
     seen = visibility(scene, cfg.train.seed)
-    near = neighbours(scene, seen, match.log_exposures, NEIGHBOURS)
+    log_exposures = np.asarray(match.photometry.log_exposures)
+    near = neighbours(scene, seen, log_exposures, NEIGHBOURS)
     wanted = [int(r) for r in evenly_spaced(len(rows), most_views) if len(near[r]) >= 2]
     flows = Flows(images, scene.points, seen)
     found: list[Candidates] = []

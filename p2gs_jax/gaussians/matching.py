@@ -2,27 +2,25 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
-import jax
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, UInt8
 
 from p2gs_jax.config import PhotometryConfig
 from p2gs_jax.core.streams import Stream, generator
 from p2gs_jax.gaussians.seeds import camera_centers
-from p2gs_jax.photometry.formation import darkens, log_vignetting, squared_radii
+from p2gs_jax.photometry.formation import inverse_formation
 from p2gs_jax.photometry.observations import Observations
-from p2gs_jax.photometry.response import Response, base_log, log_exposed, spline_of
+from p2gs_jax.photometry.response import base_log
 from p2gs_jax.render.warp import project_points
 from p2gs_jax.scene.pixels.store import ImageStore
 from p2gs_jax.scene.visibility import in_frame, unoccluded
 from p2gs_jax.types import GAMMA_SRGB, Photometry, Scene
 
-TABLE = 1024  # entries of a tabulated tone curve
 LUMINANCE = np.array([0.25, 0.6, 0.15], np.float32)  # approximate weights of R, G, B
 # Number of images in memory: some views and their neighbours.
 CACHED = 48
@@ -41,26 +39,11 @@ MOST_POINTS = 20_000  # largest number of points compared without tracks
 FEWEST_HIDING = 1000
 
 
-@dataclass(frozen=True)
-class Tones:
-    """The map from display values of training views to radiance, L = T^-1(y) / (e W V), in NumPy.
+class Tones(NamedTuple):
+    """Photometry of the training views, as host arrays, and the formation that it belongs to."""
 
-    Exposures are natural logarithms; white balances are log factors on the channels. `formation`
-    has the base curve with its splines, cameras and pivot; `cameras` is the row of each view in
-    `formation.cameras`.
-    """
-
-    log_exposures: Float[np.ndarray, " v"]
-    gammas: Float[np.ndarray, " v"]
-    formation: PhotometryConfig = field(default_factory=PhotometryConfig)
-    white_balance: Float[np.ndarray, "v 3"] | None = None
-    cameras: tuple[int, ...] | None = None
-
-    @classmethod
-    def of(cls, photometry: Photometry, formation: PhotometryConfig) -> Tones:
-        """Return the tones of a fit."""
-        host: Any = jax.tree.map(np.asarray, photometry)
-        return cls(host.log_exposures, host.gammas, formation, host.white_balance, host.cameras)
+    photometry: Photometry
+    formation: PhotometryConfig
 
     def log_radiance(
         self,
@@ -72,29 +55,9 @@ class Tones:
 
         Single pixels need `positions` if vignetting is modelled (photometry/formation.py:places).
         """
-        camera = None if self.cameras is None else self.cameras[row]
-        y = np.linspace(0.0, 1.0, TABLE)
-        log_pivot = np.log(self.formation.pivot)
-        if self.formation.curve == "linear":
-            exposed = [np.log(np.maximum(y, 0.5 / 255))]
-        else:
-            base = "power" if self.formation.curve == "power" else "srgb"
-            splines = (None,)
-            if self.formation.curve == "spline":
-                splines = spline_of(self.formation, camera)
-            exposed = [log_exposed(y, Response(base, spline))[0] for spline in splines]
-        power = self.gammas[row] / GAMMA_SRGB
-        curves = [log_pivot + (z - log_pivot) * power - self.log_exposures[row] for z in exposed]
-        if len(curves) == 1:
-            logs = np.interp(ldr, y, curves[0])
-        else:
-            logs = np.stack([np.interp(ldr[..., c], y, curves[c]) for c in range(3)], -1)
-        if self.white_balance is not None:
-            logs = logs - self.white_balance[row]
-        if camera is not None and darkens(self.formation):
-            squared = squared_radii(*ldr.shape[:2]) if positions is None else (positions**2).sum(-1)
-            logs = logs - log_vignetting(squared, camera, self.formation)
-        return logs.astype(np.float32)
+        capture = self.photometry.capture(row)
+        light = inverse_formation(ldr, capture, self.formation, positions)
+        return np.log(np.maximum(light, np.finfo(np.float32).tiny)).astype(np.float32)
 
 
 def rough_tones(tracks: Observations | None, count: int) -> Tones:
@@ -104,9 +67,9 @@ def rough_tones(tracks: Observations | None, count: int) -> Tones:
     the log factor is the mean residual of log radiance from the mean of each point. Without tracks,
     all factors are 1.
     """
-    log_exposures, gammas = np.zeros(count), np.full(count, GAMMA_SRGB)
+    log_exposures = np.zeros(count)
     if tracks is None or not len(tracks.points):
-        return Tones(log_exposures, gammas)
+        return _factors(log_exposures)
     good = ((tracks.colors > 0.03) & (tracks.colors < 0.95)).all(1)  # neither black nor clipped
     z = base_log(tracks.colors[good], "srgb")[0].mean(1)
     views, points = tracks.views[good], tracks.points[good]
@@ -117,7 +80,12 @@ def rough_tones(tracks: Observations | None, count: int) -> Tones:
         off = np.clip(z - log_exposures[views] - mean[points], -1.0, 1.0)  # bounds outliers
         log_exposures = log_exposures + np.bincount(views, off, count) / per_view
         log_exposures -= log_exposures.mean()
-    return Tones(log_exposures, gammas)
+    return _factors(log_exposures)
+
+
+def _factors(log_exposures: Any) -> Tones:
+    """Return tones of the sRGB curve with these exposures."""
+    return Tones(Photometry(log_exposures, 0 * log_exposures), PhotometryConfig())
 
 
 @dataclass(frozen=True)
@@ -179,7 +147,8 @@ class MatchImages:
         usable = cv2.erode(usable.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
         luminance = np.exp(self.tones.log_radiance(row, ldr)) @ LUMINANCE
         pose = viewmat.astype(np.float64), K.astype(np.float64)
-        return MatchImage(ldr, luminance, usable, *pose, float(self.tones.log_exposures[row]))
+        log_exposure = float(self.tones.photometry.log_exposures[row])
+        return MatchImage(ldr, luminance, usable, *pose, log_exposure)
 
 
 def at_common_exposure(

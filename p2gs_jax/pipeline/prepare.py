@@ -128,7 +128,7 @@ def initialise(found: Survey, exposures: Exposures, reporter: Reporter | None = 
 
 def _matched(found: Survey, exposures: Exposures, cfg: FitConfig, reporter: Reporter) -> DenseSeeds:
     scene = found.scene
-    color = Tones.of(exposures.photometry, cfg.photometry)
+    color = Tones(jax.tree.map(np.asarray, exposures.photometry), cfg.photometry)
     rough = rough_tones(exposures.observations, len(scene.training_views))
     return dense_seeds(
         scene,

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from scene.helpers import make_view
 
-from p2gs_jax import Scene, preset
-from p2gs_jax.config import DataConfig, DensifyConfig, FitConfig
+from p2gs_jax import Photometry, Scene, preset
+from p2gs_jax.config import DataConfig, DensifyConfig, FitConfig, PhotometryConfig
 from p2gs_jax.core.numerics import srgb_encode
 from p2gs_jax.gaussians import matching
 from p2gs_jax.gaussians.dense import MATCH_SIDE, coverage_of, dense_limit, dense_seeds, wants_dense
@@ -74,7 +74,8 @@ class World:
         colors = np.full((len(points), 3), 128, np.uint8)
         self.scene = Scene(path, "test", tuple(views), points, colors)
         self.store = ImageStore(views, DataConfig())
-        self.tones = matching.Tones(np.log(exposures), np.full(len(views), 2.2))
+        photometry = Photometry(np.log(exposures), np.zeros(len(views)))
+        self.tones = matching.Tones(photometry, PhotometryConfig())
 
     def depth(self, row=0):
         cfg = FitConfig().loss
@@ -208,9 +209,9 @@ def test_rough_tones_find_the_factors():
     views, points = (g.ravel() for g in np.meshgrid(np.arange(8), np.arange(300)))
     colors = srgb_encode(np.minimum(radiance[points] * np.exp(log_exposures[views])[:, None], 1))
     tracks = Observations(views, points, colors, 0 * colors, 8, 300, np.zeros(8, int))
-    found = matching.rough_tones(tracks, 8).log_exposures
+    found = matching.rough_tones(tracks, 8).photometry.log_exposures
     np.testing.assert_allclose(found, log_exposures - log_exposures.mean(), atol=0.05)
-    assert not matching.rough_tones(None, 8).log_exposures.any()
+    assert not matching.rough_tones(None, 8).photometry.log_exposures.any()
 
 
 def with_seeds(cfg, **changes):
