@@ -11,13 +11,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+import jax
 import numpy as np
 from jax.sharding import Mesh
 
 from p2gs_jax.config import FitConfig
-from p2gs_jax.core.atomic import no_empty_folders
+from p2gs_jax.core.atomic import atomic_folder, no_empty_folders
 from p2gs_jax.core.clock import Stopwatch
 from p2gs_jax.core.progress import Reporter, Silent
+from p2gs_jax.gaussians.population import EMPTY_LOGIT
 from p2gs_jax.gaussians.posed import chosen
 from p2gs_jax.gaussians.seeds import reach
 from p2gs_jax.photometry.appearance import Formation, exposures_apart
@@ -30,19 +32,20 @@ from p2gs_jax.pipeline.exposures import solve_exposures
 from p2gs_jax.pipeline.finish import Account, finish, seconds_to_finish
 from p2gs_jax.pipeline.preflight import Paths, check_run_dir, memory_named
 from p2gs_jax.pipeline.prepare import Prepared, expected, initialise
-from p2gs_jax.pipeline.snapshots import Snapshots
 from p2gs_jax.pipeline.survey import Survey, load, survey
 from p2gs_jax.presets import require_config, with_values
 from p2gs_jax.render.selfcheck import suited
 from p2gs_jax.run.checkpoint import saved_steps
 from p2gs_jax.run.decisions import Decisions, kept_choice, likely, with_choice
 from p2gs_jax.run.folder import RunFolder, locked
-from p2gs_jax.run.write import first_plan, write_start
+from p2gs_jax.run.scene_file import write_scene
+from p2gs_jax.run.write import first_plan, write_run, write_start
 from p2gs_jax.scene.pixels.store import decoded_into
 from p2gs_jax.train.data_parallel import mesh_of
 from p2gs_jax.train.inputs import TrainingViews
 from p2gs_jax.train.loop import Trainer, TrainResult
 from p2gs_jax.train.make_step import AS_CONFIGURED, Custom
+from p2gs_jax.train.state import FitState
 from p2gs_jax.train.step import StepPrograms
 from p2gs_jax.train.strategies import Strategy
 from p2gs_jax.train.terms import LossTerm
@@ -50,6 +53,8 @@ from p2gs_jax.types import Params, Scene, View
 
 # Gaussians farther away than this many times the reach of the scene are not visible in any view.
 RUNAWAY = 10.0
+# Seconds between two looks for a request, and the largest share of a run's time for snapshots.
+LOOK_S, SHARE = 1.0, 0.03
 
 
 @dataclass(frozen=True)
@@ -246,6 +251,44 @@ class Optimiser:
             strategy=self._custom.strategy,
             look=Snapshots(self._folder, start).look,
         )
+
+
+class Snapshots:
+    """Writes snapshots of a running fit for `p2gs-jax view`; without a viewer it writes none.
+
+    A viewer asks for a snapshot with the file `RunFolder.wanted`, which the fit removes.
+    """
+
+    def __init__(self, folder: RunFolder, start: Prepared):
+        self._folder, self._start = folder, start
+        self._next, self._has_scene = 0.0, False
+
+    def look(self, state: Callable[[], FitState], stops: bool) -> None:
+        """Write a snapshot if a viewer wants one, or if the run stops unfinished (`stops`)."""
+        begin, folder = time.monotonic(), self._folder
+        if begin < self._next and not stops:
+            return
+        self._next = begin + LOOK_S
+        if stops or folder.wanted.exists():
+            self._write(state())
+            folder.wanted.unlink(missing_ok=True)
+            self._next += (time.monotonic() - begin) / SHARE
+
+    def _write(self, state: FitState) -> None:
+        start, population = self._start, state.population
+        params = exposures_apart(jax.tree.map(np.asarray, state.params))
+        # All slots are written: the number of rows stays, and a viewer needs no other program.
+        logits = np.where(population.alive, params.gaussians.opacity_logits, EMPTY_LOGIT)
+        gaussians = dataclasses.replace(params.gaussians, opacity_logits=logits)
+        params = dataclasses.replace(params, gaussians=gaussians)
+        owner = None if population.owner is None else np.asarray(population.owner)
+        if not self._has_scene:
+            write_scene(self._folder.root, start.scene)
+            self._has_scene = True
+        objects = {"owner": owner, "moving": start.survey.store.moving}
+        with atomic_folder(self._folder.snapshot) as at:
+            folder = RunFolder(self._folder.root, at)
+            write_run(folder, params, start.scene, start.cfg, **objects, metering=None)
 
 
 def compact(result: TrainResult, scene: Scene | None = None) -> tuple[Params, np.ndarray | None]:

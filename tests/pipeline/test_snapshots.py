@@ -9,7 +9,7 @@ import pytest
 from p2gs_jax import fit, load_run
 from p2gs_jax.core.interrupts import Interrupted
 from p2gs_jax.core.progress import Reporter
-from p2gs_jax.pipeline import snapshots
+from p2gs_jax.gaussians.population import EMPTY_LOGIT
 from p2gs_jax.presets import from_dict
 from p2gs_jax.run.folder import RunFolder
 from p2gs_jax.viewer.follow import Follower
@@ -37,7 +37,7 @@ class Watched(Reporter):
 def test_a_snapshot_is_written_on_request_and_the_fit_stays_the_same(
     finished_run, tmp_path, monkeypatch
 ):
-    monkeypatch.setattr(snapshots, "LOOK_S", 0.0)
+    monkeypatch.setattr("p2gs_jax.pipeline.fit.LOOK_S", 0.0)
     watched = Watched(finished_run, tmp_path, 60, lambda run: run.wanted.touch())
     assert watched.existed == [False] * 6
     assert not watched.run.snapshot.exists()
@@ -46,7 +46,7 @@ def test_a_snapshot_is_written_on_request_and_the_fit_stays_the_same(
         assert (tmp_path / name).read_bytes() == (finished_run / name).read_bytes()
     # A snapshot that is requested at the last step shows the end of the fit.
     shown, end = watched.last, load_run(finished_run)
-    there = np.asarray(shown.params.gaussians.opacity_logits) > snapshots.EMPTY_LOGIT
+    there = np.asarray(shown.params.gaussians.opacity_logits) > EMPTY_LOGIT
     means = np.asarray(shown.params.gaussians.means)[there]
     np.testing.assert_array_equal(means, end.params.gaussians.means)
     row = end.scene.train_indices[1]
