@@ -11,7 +11,6 @@ from p2gs_jax.scene.drives import (
     argoverse,
     drivestudio,
     kitti,
-    kitti_tracking,
     nuscenes,
     pandaset,
     waymo,
@@ -46,8 +45,7 @@ FORMATS: dict[SceneFormat, DriveFormat] = {
     "argoverse": DriveFormat(_in_folders(argoverse.MARKER), argoverse.read_argoverse),
     "kitti_raw": DriveFormat(_in_folders(kitti.MARKER), kitti.read_kitti_raw),
     "kitti_tracking": DriveFormat(
-        (kitti_tracking.MARKER, f"{kitti_tracking.SET}/{kitti_tracking.MARKER}"),
-        kitti_tracking.read_kitti_tracking,
+        (kitti.TRACKING, f"{kitti.TRACKING_SET}/{kitti.TRACKING}"), kitti.read_kitti_tracking
     ),
     "drivestudio": DriveFormat(_in_folders(drivestudio.MARKER), drivestudio.read_drivestudio),
 }
