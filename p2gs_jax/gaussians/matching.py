@@ -18,7 +18,7 @@ from p2gs_jax.photometry.observations import Observations
 from p2gs_jax.photometry.response import base_log
 from p2gs_jax.render.warp import project_points
 from p2gs_jax.scene.pixels.store import ImageStore
-from p2gs_jax.scene.visibility import in_frame, unoccluded
+from p2gs_jax.scene.visibility import in_frame, tracked, unoccluded
 from p2gs_jax.types import GAMMA_SRGB, Photometry, Scene
 
 LUMINANCE = np.array([0.25, 0.6, 0.15], np.float32)  # approximate weights of R, G, B
@@ -171,13 +171,10 @@ def at_common_exposure(
 def visibility(scene: Scene, seed: int) -> Bool[np.ndarray, "v p"]:
     """Return whether each training view sees each point: from tracks, else from projection."""
     rows = scene.train_indices
+    by_tracks = tracked(scene, rows)
+    if by_tracks is not None:
+        return by_tracks.toarray()
     seen = np.zeros((len(rows), len(scene.points)), bool)
-    if scene.tracks is not None and len(scene.tracks.xy):
-        row_of = np.full(len(scene.views), -1)
-        row_of[list(rows)] = np.arange(len(rows))
-        view = row_of[scene.tracks.view_indices]
-        seen[view[view >= 0], scene.tracks.point_indices[view >= 0]] = True
-        return seen
     for row, index in enumerate(rows):
         view = scene.views[index]
         xy, z = project_points(scene.points, view)

@@ -7,10 +7,11 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy.ndimage import minimum_filter
+from scipy.sparse import csr_array
 
 from p2gs_jax.core.numerics import evenly_spaced
 from p2gs_jax.render.warp import project_points
-from p2gs_jax.types import View
+from p2gs_jax.types import Scene, View
 
 # A nearer point hides a point within about this many spacings of points in the image, ...
 SPACINGS = 1.5
@@ -18,6 +19,19 @@ SPACINGS = 1.5
 DEPTH_MARGIN = 0.05
 # The largest numbers of views and points, sampled evenly, for `share_in_view`.
 SHARE_VIEWS, SHARE_POINTS = 32, 20_000
+
+
+def tracked(scene: Scene, rows: Sequence[int]) -> csr_array | None:
+    """Return whether each of some views sees each point by its tracks; None: there are no tracks.
+
+    `rows` are those of `scene.views`, in the order of the rows of the result.
+    """
+    tracks = scene.tracks
+    if tracks is None or not len(tracks.xy):
+        return None
+    where = tracks.view_indices, tracks.point_indices
+    shape = len(scene.views), len(scene.points)
+    return csr_array((np.ones(len(tracks.xy), bool), where), shape=shape)[list(rows)]
 
 
 def in_frame(

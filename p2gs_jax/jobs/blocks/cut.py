@@ -17,10 +17,9 @@ from jaxtyping import Bool, Float, Int
 from p2gs_jax.core.numerics import evenly_spaced
 from p2gs_jax.errors import UserError
 from p2gs_jax.gaussians.seeds import camera_centers
-from p2gs_jax.photometry.observations import grouped
 from p2gs_jax.render.warp import project_points
 from p2gs_jax.scene.split import only
-from p2gs_jax.scene.visibility import in_frame
+from p2gs_jax.scene.visibility import in_frame, tracked
 from p2gs_jax.types import Scene, View
 
 # A block extends beyond its core by this share of the length of the shortest core.
@@ -189,9 +188,9 @@ def _length(places: Float[np.ndarray, "v 2"]) -> float:
 def seen_points(scene: Scene) -> list[Int[np.ndarray, " _"]]:
     """Return the points that each training view sees: by tracks, else by projecting a sample."""
     rows = scene.train_indices
-    if scene.tracks is not None and len(scene.tracks.xy):
-        of_view = grouped(scene.tracks.view_indices, len(scene.views))
-        return [scene.tracks.point_indices[of_view[i]] for i in rows]
+    seen = tracked(scene, rows)
+    if seen is not None:
+        return np.split(seen.indices, seen.indptr[1:-1])
     picked = np.arange(0, len(scene.points), max(1, len(scene.points) // MOST_PROJECTED))
     return [picked[shows(scene.views[i], scene.points[picked])] for i in rows]
 
@@ -235,9 +234,9 @@ def block_scene(scene: Scene, cut: Cut, number: int) -> tuple[Scene, Int[np.ndar
 
 def _seen(scene: Scene, rows: Int[np.ndarray, " k"]) -> Bool[np.ndarray, " p"]:
     """Return the mask of points that any view sees: by tracks, else by projection into a few."""
-    seen = np.zeros(len(scene.points), bool)
-    if scene.tracks is not None and len(scene.tracks.xy):
-        seen[scene.tracks.point_indices[np.isin(scene.tracks.view_indices, rows)]] = True
+    by_tracks, seen = tracked(scene, rows), np.zeros(len(scene.points), bool)
+    if by_tracks is not None:
+        seen[by_tracks.indices] = True
         return seen
     for k in evenly_spaced(len(rows), MOST_LOOKED):
         seen |= shows(scene.views[rows[k]], scene.points)
