@@ -28,19 +28,18 @@ from scipy.spatial.transform import Rotation
 
 from p2gs_jax.config import LossConfig
 from p2gs_jax.core.numerics import evenly_spaced
+from p2gs_jax.gaussians.matching import visibility
 from p2gs_jax.photometry.display import DisplayTransform, develop, undevelop
 from p2gs_jax.photometry.formation import inverse_tone_map, places
 from p2gs_jax.render.warp import project_points, sample_bilinear, surface_depth, unproject, warp
 from p2gs_jax.scene.rigid import camera_centers, moment_of, pose_of
-from p2gs_jax.scene.visibility import unoccluded
+from p2gs_jax.scene.visibility import tracked
 from p2gs_jax.types import Camera, Render, Scene
 
 # Least number of shared pixels.
 FEWEST_PIXELS = 200
 # Least number of shared points of a pair of views.
 FEWEST_SHARED = 30
-# Largest number of points among which shared ones are counted, if there are no tracks.
-MOST_COUNTED = 5000
 # A picture of a seam uses rendered depth where the opacity is at least OPAQUE, and elsewhere FAR
 # times the largest rendered depth. Pixels without a photograph have the display value BLANK.
 OPAQUE, FAR = 0.5, 100.0
@@ -76,7 +75,12 @@ def neighbouring_pairs(scene: Scene, most: int) -> list[tuple[int, int]]:
     view with which it shares most points. There are at most `most` pairs, evenly spread over views.
     """
     train = scene.train_indices
-    shared = _shared_points(scene)
+    seen = tracked(scene, train)
+    if seen is None:
+        seen = csr_array(visibility(scene, 0))
+    seen = seen.astype(np.float32)
+    shared = (seen @ seen.T).toarray()
+    np.fill_diagonal(shared, 0)
     moments = [moment_of(scene.views[i]) for i in train]
     cameras = [scene.views[i].camera for i in train]
     together = [
@@ -98,27 +102,6 @@ def _closest(shared: np.ndarray) -> list[tuple[int, int]]:
     best = near.argmax(1).tolist() if len(shared) > 1 else []
     pairs = {(min(a, b), max(a, b)) for a, b in enumerate(best)}
     return sorted(p for p in pairs if shared[p] >= FEWEST_SHARED)
-
-
-def _shared_points(scene: Scene) -> np.ndarray:
-    """Return the number of shared points of every two training views, 0 on the diagonal."""
-    train = list(scene.train_indices)
-    if scene.tracks is not None and len(scene.tracks.xy):
-        where = (scene.tracks.view_indices, scene.tracks.point_indices)
-        shape = (len(scene.views), len(scene.points))
-        seen = csr_array((np.ones(len(where[0]), np.float32), where), shape=shape)
-        seen.data[:] = 1
-        seen = seen.tocsr()[train]
-    else:
-        rows = []
-        counted = evenly_spaced(len(scene.points), MOST_COUNTED)
-        for view in (scene.views[i] for i in train):
-            xy, z = project_points(scene.points, view)
-            rows.append(unoccluded(xy, z, view.width, view.height)[counted])
-        seen = csr_array(np.array(rows, np.float32))
-    shared = (seen @ seen.T).toarray()
-    np.fill_diagonal(shared, 0)
-    return shared
 
 
 def measure_seam(
