@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from scipy.ndimage import minimum_filter
 from scipy.sparse import csr_array
 
@@ -21,7 +21,7 @@ DEPTH_MARGIN = 0.05
 SHARE_VIEWS, SHARE_POINTS = 32, 20_000
 
 
-def tracked(scene: Scene, rows: Sequence[int]) -> csr_array | None:
+def tracked(scene: Scene, rows: Sequence[int] | Int[np.ndarray, " k"]) -> csr_array | None:
     """Return whether each of some views sees each point by its tracks; None: there are no tracks.
 
     `rows` are those of `scene.views`, in the order of the rows of the result.

@@ -21,8 +21,6 @@ from p2gs_jax.photometry.formation import darkens, gain, inverse_formation, tone
 from p2gs_jax.photometry.observations import Observations, sample_pairs
 from p2gs_jax.types import Array, Photometry
 
-# Least share of valid pairs in the denominator of the mean.
-FEWEST_VALID = 0.01
 # Number of pairs from which the steps of a fit draw.
 PAIR_POOL = 200_000
 
@@ -34,7 +32,6 @@ class ColorPairs(eqx.Module):
     colors_j: Float[Array, "m 3"]  # display-encoded colours in the second view
     views_i: Int[Array, " m"]  # rows of the first views in `Photometry`
     views_j: Int[Array, " m"]  # rows of the second views in `Photometry`
-    valid: Float[Array, " m"]  # 1 = use
     # positions in the first view's image, from its centre in units of half its diagonal; None if
     # vignetting is not modelled
     positions_i: Float[Array, "m 2"] | None = None
@@ -64,7 +61,7 @@ def usable(colors: Float[Array, "m 3"], cfg: LossConfig) -> Float[Array, "m 3"]:
 def observed_ldr(
     pairs: ColorPairs, photometry: Photometry, loss: LossConfig, cfg: PhotometryConfig
 ) -> Float[Array, ""]:
-    """Return the mean of Huber(T_j(alpha T_i^-1(I_i(u))) - I_j(w(u))) over valid pairs.
+    """Return the mean of Huber(T_j(alpha T_i^-1(I_i(u))) - I_j(w(u))) over pairs.
 
     One point is at u and at w(u). This is the principle of invariant radiance in display units, and
     scale-invariant. The error of values that are near black or saturated counts as zero. The Huber
@@ -76,9 +73,8 @@ def observed_ldr(
     display = tone_map(predicted, capture_j.gamma[:, None], cfg, capture_j.camera)
     delta = loss.relative_exposure.huber_delta
     error = optax.huber_loss(display, pairs.colors_j, delta=delta) / delta
-    weight = usable(pairs.colors_i, loss) * usable(pairs.colors_j, loss) * pairs.valid[:, None]
-    fewest = FEWEST_VALID * pairs.valid.size
-    return jnp.sum(weight * error) / jnp.maximum(jnp.sum(pairs.valid), fewest)
+    weight = usable(pairs.colors_i, loss) * usable(pairs.colors_j, loss)
+    return jnp.sum(weight * error) / len(weight)
 
 
 def relative_exposure_loss(
@@ -126,6 +122,5 @@ def color_pairs(tracks: Observations | None, cfg: FitConfig) -> ColorPairs | Non
         on_device(tracks.colors[second]),
         on_device(tracks.views[first], np.int32),
         on_device(tracks.views[second], np.int32),
-        on_device(np.ones(len(first))),
         *map(on_device, places),
     )

@@ -147,7 +147,7 @@ def observed(seed, cfg, noise_free=True, views=5, n=400):
     I = [np.clip(a, 0, 1) for a in I]
     if not noise_free:
         I = [np.rint(a * 255) / 255 for a in I]
-    rows = (i.astype(np.int32), j.astype(np.int32), np.ones(n, np.float32))
+    rows = (i.astype(np.int32), j.astype(np.int32))
     return rel.ColorPairs(*(jnp.asarray(a) for a in (*I, *rows))), jax.tree.map(jnp.asarray, truth)
 
 

@@ -46,7 +46,7 @@ def observed(photometry, cfg, count=400) -> rel.ColorPairs:
         formation(radiance, photometry.capture(jnp.asarray(r)), cfg=cfg, positions=p)
         for r, p in zip(rows, at, strict=True)
     ]
-    return rel.ColorPairs(*colors, *map(jnp.asarray, rows), jnp.ones(count), *at)
+    return rel.ColorPairs(*colors, *map(jnp.asarray, rows), *at)
 
 
 @CONFIGS
