@@ -189,7 +189,7 @@ class DisplayFiles:
         rows = [*wanted, *_spread(scene.test_indices)]
         for done, index in enumerate(rows):
             name, camera = scene.views[index].name, camera_of(fitted.store, index)
-            self.targets[index] = baking.true_target(name, g, camera, transform, render)
+            self.targets[index] = baking.target(name, g, camera, render, transform)
             reporter.stage("Rendering true pictures", done + 1, len(rows))
         reporter.stage("Baking")
         start = baking.bake(g, transform, cfg.render.radiance)

@@ -55,19 +55,20 @@ class Target:
     picture: UInt8[np.ndarray, "h w 3"]
 
 
-def displayed_target(name: str, splats: Gaussians, camera: Camera, render: RenderView) -> Target:
-    """Return a view with the picture of a viewer (`viewer_config`), which shows display colours."""
-    display = np.asarray(render(splats, _all(splats), camera).linear)
-    return Target(name, camera, np.rint(255 * np.clip(display, 0, 1)).astype(np.uint8))
-
-
-def true_target(
-    name: str, gaussians: Gaussians, camera: Camera, transform: DisplayTransform, render: RenderView
+def target(
+    name: str,
+    gaussians: Gaussians,
+    camera: Camera,
+    render: RenderView,
+    transform: DisplayTransform | None = None,
 ) -> Target:
-    """Return a view with its true picture: linear radiance is composited, then developed."""
-    linear = render(gaussians, _all(gaussians), camera).linear
-    picture = np.rint(255 * develop(linear, transform)).astype(np.uint8)
-    return Target(name, camera, picture)
+    """Return a view with its true picture: linear radiance is composited, then developed.
+
+    Without a `transform` it is the picture of a viewer (`viewer_config`) of display colours.
+    """
+    linear = np.asarray(render(gaussians, _all(gaussians), camera).linear)
+    display = np.clip(linear, 0, 1) if transform is None else develop(linear, transform)
+    return Target(name, camera, np.rint(255 * display).astype(np.uint8))
 
 
 def display_comments(transform: DisplayTransform) -> list[str]:
@@ -197,12 +198,12 @@ def refine(
     state = optimizer.init(trained)
     for done in range(steps):
         order = order or list(rng.permutation(len(targets)))
-        target = targets[order.pop()]
+        view = targets[order.pop()]
         decay = jnp.float32(DECAY ** (done / steps))
-        picture = jnp.asarray(target.picture)
+        picture = jnp.asarray(view.picture)
         bright = done % 2 if shown is None else 0
         background = jnp.asarray(rng.uniform(size=3) * bright, jnp.float32)
-        inputs = (trained, state, target.camera, picture, background, decay)
+        inputs = (trained, state, view.camera, picture, background, decay)
         (trained, state), capacity = until_it_fits(
             lambda entries, inputs=inputs: step(*inputs, capacity=entries), capacity
         )

@@ -81,7 +81,7 @@ class ForeignRun(read.Run):
         for row in evenly_spaced(len(self.scene.views), MEASURED):
             view = self.scene.views[row]
             camera = camera_of(self.store, row, max(view.width / MEASURED_WIDTH, 1.0))
-            targets.append(bake.displayed_target(view.name, self.splats, camera, render))
+            targets.append(bake.target(view.name, self.splats, camera, render))
         lifted = self.params.gaussians
         lifted = bake.refine(lifted, targets, cfg, steps=steps, shown=developed, on_step=on_step)
         e: Any = bake.baking_error(lifted, targets, cfg, developed)

@@ -58,7 +58,7 @@ def test_corrections_by_position_in_the_image_are_left_out():
 def targets():
     render = make_renderer(CFG)
     views = {f"{x:+.1f}": camera(x) for x in (-0.4, -0.2, 0.0, 0.2, 0.4)}
-    return [bake.true_target(name, haze(), c, SRGB, render) for name, c in views.items()]
+    return [bake.target(name, haze(), c, render, SRGB) for name, c in views.items()]
 
 
 def test_the_true_picture_is_composited_in_light_and_then_developed(targets):
@@ -99,7 +99,7 @@ def test_a_wall_that_is_dark_by_transparency_becomes_opaque():
     """A translucent black wall looks opaque over black, and not over white."""
     wall, logits = haze(), jnp.full(120, -100.0, jnp.float32).at[-1].set(0.0)
     wall = replace(wall, opacity_logits=logits, sh=wall.sh - 60.0)
-    target = bake.true_target("wall", wall, camera(), SRGB, make_renderer(CFG))
+    target = bake.target("wall", wall, camera(), make_renderer(CFG), SRGB)
     assert target.picture.max() == 0
     plain = bake.bake(wall, SRGB, "exp")
     assert bake.refine(plain, [target], CFG, steps=0) is plain
@@ -127,7 +127,7 @@ def test_lifted_colours_look_in_linear_light_as_in_a_viewer():
     """Translucent Gaussians differ; refining brings them closer, in unseen views as well."""
     shown, render = bake.bake(haze(), SRGB, "exp"), make_renderer(bake.viewer_config(CFG))
     places = {f"{x:+.1f}": camera(x) for x in (-0.4, -0.2, 0.0, 0.2, 0.4)}
-    views = [bake.displayed_target(name, shown, c, render) for name, c in places.items()]
+    views = [bake.target(name, shown, c, render) for name, c in places.items()]
     plain = bake.lift(shown, SRGB)
     refined = bake.refine(plain, views[::2], CFG, steps=60, shown=SRGB)
     for part in (views[::2], views[1::2]):
