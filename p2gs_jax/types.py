@@ -14,9 +14,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jaxtyping import Array, Bool, Float, Float32, Float64, Int, UInt, UInt8
 
 if not TYPE_CHECKING:
@@ -38,7 +38,7 @@ def _at_least(values, floor: float) -> Any:
     """Return the larger of each value and the floor; the gradient is 1 in both cases."""
     if isinstance(values, np.ndarray):
         return np.maximum(values, floor)
-    return jnp.where(values > floor, values, floor + (values - lax.stop_gradient(values)))
+    return jnp.where(values > floor, values, floor + (values - jax.lax.stop_gradient(values)))
 
 
 GAMMA_SRGB = 2.2  # gamma under which a tone curve equals its base, such as sRGB
@@ -77,6 +77,11 @@ class Gaussians(eqx.Module):
     def capacity(self) -> int:
         """Number of slots, alive or not."""
         return self.means.shape[0]
+
+    @property
+    def all_alive(self) -> Bool[Array, " n"]:
+        """The mask of live slots if there are no empty ones."""
+        return jax.device_put(np.ones(self.capacity, bool))
 
 
 class Capture(eqx.Module):

@@ -122,8 +122,8 @@ def evaluate(
     """
     judge = Judge(scene, store, params, cfg, lpips_weights, reference)
     gaussians = jax.device_put(params.gaussians)
-    living = jax.device_put(np.ones(params.gaussians.capacity, bool))
-    render_camera = functools.partial(render or make_renderer(cfg.render), gaussians, living)
+    render = render or make_renderer(cfg.render)
+    render_camera = functools.partial(render, gaussians, gaussians.all_alive)
     views = _Views(judge, render_camera, radiance)
     judged = functools.partial(_judged, judge, render_camera, radiance)
     # Views are in the order of names, in which the frames of a camera are in sequence.

@@ -152,7 +152,7 @@ def weights(
     At radiance 1 it is the derivative of the sum of all pixels by the Gaussian's log radiance.
     """
     plain = replace(cfg, radiance="exp")
-    alive = on_device(np.ones(gaussians.capacity), bool)
+    alive = gaussians.all_alive
     sh = on_device(np.zeros((gaussians.capacity, 1, 3)))
     needed = max(int(count_needed(gaussians, alive, camera, cfg=plain)) for camera in cameras)
     capacity, total = bucket(needed, PICTURES), np.zeros(gaussians.capacity)
@@ -226,4 +226,4 @@ def _stops(linear: Float32[np.ndarray, "h w 3"], true: RunPicture) -> Float[np.n
 
 def radiance_of(g: Gaussians, camera: Camera, render: RenderView) -> Float32[np.ndarray, "h w 3"]:
     """Return the linear radiance of all Gaussians in the picture of a camera."""
-    return np.asarray(render(g, on_device(np.ones(g.capacity), bool), camera).linear)
+    return np.asarray(render(g, g.all_alive, camera).linear)

@@ -66,7 +66,7 @@ def target(
 
     Without a `transform` it is the picture of a viewer (`viewer_config`) of display colours.
     """
-    linear = np.asarray(render(gaussians, _all(gaussians), camera).linear)
+    linear = np.asarray(render(gaussians, gaussians.all_alive, camera).linear)
     display = np.clip(linear, 0, 1) if transform is None else develop(linear, transform)
     return Target(name, camera, np.rint(255 * display).astype(np.uint8))
 
@@ -168,7 +168,7 @@ def refine(
     if steps == 0 or not targets or gaussians.capacity == 0:
         return gaussians
     cfg, optimizer = cfg if shown else viewer_config(cfg), optax.scale_by_adam(eps=1e-15)
-    alive = _all(gaussians)
+    alive = gaussians.all_alive
     needed = max(int(count_needed(gaussians, alive, t.camera, cfg=cfg)) for t in targets)
     capacity = bucket(needed, PICTURES)
     bands = jnp.full((gaussians.sh.shape[1], 1), BANDS_RATE).at[0].set(COLOR_RATE)
@@ -179,7 +179,7 @@ def refine(
     def step(trained, state, camera, picture, background, decay, *, capacity):
         def loss(trained):
             current = replace(gaussians, **trained)
-            result = render_linear(current, _all(current), camera, cfg, capacity, with_depth=False)
+            result = render_linear(current, alive, camera, cfg, capacity, with_depth=False)
             display = _over(result, background)
             if shown is not None:
                 display = formation(display, shown.capture, shown.formation)
@@ -227,9 +227,8 @@ def baking_error(
     if not targets:
         return None
     render = make_renderer(viewer_config(cfg) if shown is None else cfg)
-    views = {
-        t.name: _difference(t, render(gaussians, _all(gaussians), t.camera), shown) for t in targets
-    }
+    render = functools.partial(render, gaussians, gaussians.all_alive)
+    views = {t.name: _difference(t, render(t.camera), shown) for t in targets}
     worst = min(views, key=lambda name: views[name]["psnr"])
     psnr, mean, most, white = zip(*(view.values() for view in views.values()), strict=True)
     return {
@@ -267,7 +266,3 @@ def _difference(target: Target, render: Render, shown: DisplayTransform | None) 
         "max_codes": float(on_black.max()),
         "psnr_on_white": psnr(from_truth(1.0)),
     }
-
-
-def _all(gaussians: Gaussians) -> Array:
-    return on_device(np.ones(gaussians.capacity), bool)

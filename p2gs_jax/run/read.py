@@ -173,7 +173,7 @@ class Run:
     @property
     def alive(self) -> Bool[Array, " n"]:
         """True for all Gaussians: a finished run has no empty slots."""
-        return on_device(np.ones(self.params.gaussians.capacity), bool)
+        return self.params.gaussians.all_alive
 
     @property
     def mean(self) -> display.MeanParameters:

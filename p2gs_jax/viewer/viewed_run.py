@@ -7,7 +7,7 @@ from functools import partial
 
 import numpy as np
 
-from p2gs_jax.core.numerics import evenly_spaced, on_device
+from p2gs_jax.core.numerics import evenly_spaced
 from p2gs_jax.photometry.display import develop
 from p2gs_jax.render.project import at_time
 from p2gs_jax.run.read import Run
@@ -42,7 +42,7 @@ class ViewedRun:
         probes = evenly_spaced(len(run.scene.views), PROBES)
         self.renderer = Renderer(
             gaussians,
-            on_device(np.ones(gaussians.capacity), bool),
+            gaussians.all_alive,
             run.cfg.render,
             [partial(self._probe, int(row)) for row in probes],
             self._notify,
@@ -52,7 +52,7 @@ class ViewedRun:
     def show(self, run: Run) -> None:
         """Show a newer state of the run; scale, cameras and photographs stay."""
         self.run, gaussians = run, at_time(run.as_of(), None)
-        self.renderer.show(gaussians, on_device(np.ones(gaussians.capacity), bool))
+        self.renderer.show(gaussians, gaussians.all_alive)
 
     def _notify(self) -> None:
         for listener in tuple(self.listeners):

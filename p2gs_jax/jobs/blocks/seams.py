@@ -66,7 +66,7 @@ def measure_seams(
         first, second = (cut.blocks[k] for k in pair)
         both = sorted(set(first.views) & set(second.views))
         fits = [fitted[k] for k in pair]
-        renderers = [partial(make_renderer(cfg), g, jax.numpy.ones(g.capacity, bool)) for g in fits]
+        renderers = [partial(make_renderer(cfg), g, g.all_alive) for g in fits]
         rows = (scene.train_indices[both[k]] for k in evenly_spaced(len(both), MOST_VIEWS))
         found = [_compared(camera_of(store, index), cut, pair, renderers) for index in rows]
         found = [parts for parts in found if len(parts[0]) >= FEWEST_PIXELS]
