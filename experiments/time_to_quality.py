@@ -26,10 +26,10 @@ from typing import Any, NamedTuple
 
 from checkout import commit, git
 from mixtures import read_groups, within_groups_ev
-from towns import ISO8, at
+from towns import ISO8
 
 from p2gs_jax.core.atomic import write_json
-from p2gs_jax.core.text import markdown_table
+from p2gs_jax.core.text import markdown_table, value_at
 from p2gs_jax.evaluation.alignment import error_of_views
 from p2gs_jax.synth.sensor import read_true_exposures
 
@@ -103,11 +103,11 @@ def execute(job: Job, words: Sequence[str], work: Path) -> dict[str, Any]:
         "date": datetime.datetime.now().isoformat(timespec="seconds"),
         "wall_s": round(wall, 2),
         "cpu_s": round(after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime, 1),
-        "steps": at(metrics, ("counts", "steps")),
-        "gaussians": at(metrics, ("counts", "gaussians")),
-        "test_psnr": at(metrics, ("test", "exposure_fitted", "psnr")),
-        "reference_test_psnr": at(metrics, (*ISO8, "test", "psnr")),
-        "ev": within_groups_ev(photometry, groups) if groups else at(error, ("ev",)),
+        "steps": value_at(metrics, ("counts", "steps")),
+        "gaussians": value_at(metrics, ("counts", "gaussians")),
+        "test_psnr": value_at(metrics, ("test", "exposure_fitted", "psnr")),
+        "reference_test_psnr": value_at(metrics, (*ISO8, "test", "psnr")),
+        "ev": within_groups_ev(photometry, groups) if groups else value_at(error, ("ev",)),
     }
 
 

@@ -23,6 +23,7 @@ from checkout import commit
 
 import p2gs_jax
 from p2gs_jax.config import FitConfig, PresetName
+from p2gs_jax.core.text import value_at
 from p2gs_jax.jobs.sweep import sweep
 from p2gs_jax.presets import to_dict
 from p2gs_jax.synth.sensor import Sensor
@@ -183,8 +184,8 @@ class Runs:
 
     def mean(self, method: str, std: float, *path: str) -> float:
         """Return the mean over towns of a value of metrics.json; NaN where none has it."""
-        found = [at(m, path) for (a, s, _), m in self.metrics.items() if (a, s) == (method, std)]
-        values = [v for v in found if v is not None]
+        runs = [m for (a, s, _), m in self.metrics.items() if (a, s) == (method, std)]
+        values = [v for v in (value_at(m, path) for m in runs) if v is not None]
         return float(np.mean(values)) if values else float("nan")
 
     def cells(self, method: str, std: float, columns: Sequence[Column]) -> list[str]:
@@ -227,13 +228,6 @@ def fit_all(o: Options, wanted: Mapping[float, Mapping[str, FitConfig]]) -> Runs
                 found = json.loads((folders[key] / "metrics.json").read_text())
                 metrics[key] = found | {"ev": row.get("ev"), "ev_power": row.get("ev_power")}
     return Runs(metrics, folders, tuple(failures), used)
-
-
-def at(values: Any, path: Sequence[str]) -> float | None:
-    """Return a value of nested mappings, or None where there is none."""
-    for key in path:
-        values = values.get(key) if isinstance(values, Mapping) else None
-    return values
 
 
 def number(value: float, digits: int) -> str:

@@ -6,7 +6,7 @@ import csv
 import json
 import re
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -70,6 +70,13 @@ def parse_json(text: str) -> Any:
         raise json.JSONDecodeError("nested too deeply", text, 0) from None
     except ValueError as error:
         raise json.JSONDecodeError(str(error), text, 0) from None
+
+
+def value_at(values: Any, path: Iterable[str]) -> Any:
+    """Return the value at a path of nested mappings, or None."""
+    for key in path:
+        values = values.get(key) if isinstance(values, Mapping) else None
+    return values
 
 
 def read_csv(

@@ -15,7 +15,7 @@ from p2gs_jax.core.atomic import write_json, write_text
 from p2gs_jax.core.clock import whole_run
 from p2gs_jax.core.progress import Reporter
 from p2gs_jax.core.runtime import tune_process, use_compile_cache
-from p2gs_jax.core.text import escaped, markdown_table, parse_json
+from p2gs_jax.core.text import escaped, markdown_table, parse_json, value_at
 from p2gs_jax.errors import UserError
 from p2gs_jax.evaluation.alignment import true_error
 from p2gs_jax.evaluation.scores import PROTOCOLS
@@ -238,9 +238,7 @@ def read_row(run: Path, scene: Path) -> dict[str, Any]:
     metrics = parse_json(RunFolder(run).metrics.read_text(encoding="utf-8"))
     row: dict[str, Any] = {}
     for column in COLUMNS:
-        value = metrics
-        for key in column.path:
-            value = value.get(key) if isinstance(value, Mapping) else None
+        value = value_at(metrics, column.path)
         if column.path and value is not None:
             row[column.name] = value
     seconds = metrics.get("seconds")

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 from p2gs_jax.config import FitConfig
 from p2gs_jax.core.atomic import read_jsonl
-from p2gs_jax.core.text import parse_json, stems
+from p2gs_jax.core.text import parse_json, stems, value_at
 from p2gs_jax.errors import UserError
 from p2gs_jax.presets import from_dict
 from p2gs_jax.run.folder import find
@@ -82,21 +82,15 @@ class RunFiles:
         return part_at(self.options, *path[:-1]).get(path[-1])
 
 
-def _at(values: Any, path: tuple[str, ...]) -> Any:
-    for key in path:
-        values = values.get(key) if isinstance(values, Mapping) else None
-    return values
-
-
 def part_at(values: Any, *path: str) -> dict[str, Any]:
     """Return the mapping at a path of nested mappings, or an empty one."""
-    found = _at(values, path)
+    found = value_at(values, path)
     return dict(found) if isinstance(found, Mapping) else {}
 
 
 def number_at(values: Any, *path: str) -> float | None:
     """Return the number at a path of nested mappings, or None."""
-    found = _at(values, path)
+    found = value_at(values, path)
     known = isinstance(found, int | float) and not isinstance(found, bool)
     return float(found) if known else None
 
