@@ -53,7 +53,6 @@ PUBLISHED: Fields = {
     "optimizer.extent": "cameras",
     "loss.near_depth": 0.0,
     "optimizer.b1": 0.9,
-    "optimizer.b2": 0.999,
     "optimizer.visible_only": False,
     "densify.method": "adaptive",
     "init.opacity": 0.1,

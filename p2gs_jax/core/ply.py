@@ -88,8 +88,8 @@ def parse_header(head: bytes, size: int) -> Header:
     return Header(order, elements, end.end())
 
 
-def header_of(name: str, row: np.dtype, count: int, comments: Sequence[str] = ()) -> bytes:
-    """Return the header of a file with one element; its rows follow in NumPy's layout.
+def header_of(row: np.dtype, count: int, comments: Sequence[str] = ()) -> bytes:
+    """Return the header of a file of vertices; their rows follow in NumPy's layout.
 
     `row` has little-endian fields without gaps. A header is ASCII: other characters of comments are
     escaped. Raises KeyError: PLY has no type for a field.
@@ -98,7 +98,7 @@ def header_of(name: str, row: np.dtype, count: int, comments: Sequence[str] = ()
         "ply",
         "format binary_little_endian 1.0",
         *(f"comment {text.encode('unicode_escape').decode()}" for text in comments),
-        f"element {name} {count}",
+        f"element vertex {count}",
         *(f"property {_WRITTEN[row[field]]} {field}" for field in row.names or ()),
         "end_header",
     ]

@@ -240,4 +240,4 @@ def _write_points(path: Path, scene: Scene) -> None:
     table, colors = np.empty(len(scene.points), fields), _colors(scene)
     for column, (axis, channel) in enumerate(zip("xyz", RGB, strict=True)):
         table[axis], table[channel] = points[:, column], colors[:, column]
-    path.write_bytes(header_of("vertex", table.dtype, len(table)) + table.tobytes())
+    path.write_bytes(header_of(table.dtype, len(table)) + table.tobytes())

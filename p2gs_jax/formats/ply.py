@@ -56,7 +56,7 @@ def write_ply(path: Path, gaussians: Gaussians, comments: Sequence[str]) -> None
     names = [*field_names(g.sh.shape[1]), *(() if g.vibration is None else VIBRATION)]
     row = np.dtype([(name, "<f4") for name in names])
     with atomic_write(path) as temporary, temporary.open("wb") as file:
-        file.write(header_of("vertex", row, g.capacity, comments))
+        file.write(header_of(row, g.capacity, comments))
         for first in range(0, g.capacity, CHUNK):
             file.write(_columns(g, slice(first, first + CHUNK)).tobytes())
 

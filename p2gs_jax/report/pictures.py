@@ -16,6 +16,7 @@ from p2gs_jax.report.run_files import RunFiles, number_at
 # Longest side of a picture, pixels: a third of the page at double resolution, or the whole page.
 SMALL, LARGE = 560, 900
 JPEG_QUALITY = 84
+MOST_SHOWN = 6  # held-out views on the page
 # A difference of 1 / GAIN of the display's range becomes white or black.
 GAIN = 4.0
 
@@ -41,8 +42,8 @@ def without_suffix(name: str) -> str:
     return name.rsplit(".", 1)[0]
 
 
-def held_out_section(run: RunFiles, most: int, problems: list[str]) -> str:
-    """Return HTML of at most `most` held-out views, evenly spaced from the worst to the best.
+def held_out_section(run: RunFiles, problems: list[str]) -> str:
+    """Return HTML of at most MOST_SHOWN held-out views, evenly spaced from the worst to the best.
 
     Each view has its photograph, its render at the fitted exposure, and their difference.
     `problems` receives a sentence for each view that cannot be read.
@@ -56,7 +57,7 @@ def held_out_section(run: RunFiles, most: int, problems: list[str]) -> str:
 
     total, body, shown = len(run.held_out), "", 0
     ranked = sorted(run.held_out, key=lambda h: rank(h.name))
-    for files in (ranked[k] for k in evenly_spaced(total, most)):
+    for files in (ranked[k] for k in evenly_spaced(total, MOST_SHOWN)):
         try:
             photograph, render = read_display(files.photograph), read_display(files.render)
         except UserError as error:

@@ -18,8 +18,6 @@ from p2gs_jax.report.measurements import SceneMeasurements
 from p2gs_jax.report.page import check_place, listed, page, paragraph, text
 from p2gs_jax.report.run_files import RunFiles, read_run
 
-MOST_COMPARED = 6  # held-out views on the page
-
 
 def write_report(
     folder: str | Path,
@@ -50,7 +48,7 @@ def report_page(run: RunFiles, measured: SceneMeasurements) -> str:
     """Return the page of a run from the files of its folder and measurements on its scene."""
     problems: list[str] = []
     truth = measured.true_exposures
-    views = pictures.held_out_section(run, MOST_COMPARED, problems)
+    views = pictures.held_out_section(run, problems)
     found = run_warnings(run)
     shown = [
         ("warnings", "Warnings", _warnings(found, run, [*measured.missing, *problems])),

@@ -95,10 +95,10 @@ class Frame:
         """The transfer function that gives light; None: the camera's tone curve."""
         return icc.TRANSFERS.get(int(self._decoded.color_trc))
 
-    def grey(self, longer_side: int) -> UInt8[np.ndarray, "h w"]:
-        """Return a small grey picture, not rotated; its longer side is at most this, pixels."""
+    def grey(self) -> UInt8[np.ndarray, "h w"]:
+        """Return a small grey picture, not rotated; its longer side is at most LONGER_SIDE."""
         frame = self._decoded
-        scale = min(1.0, longer_side / max(frame.width, frame.height))
+        scale = min(1.0, LONGER_SIDE / max(frame.width, frame.height))
         # swscale needs even widths.
         size = [max(2, round(n * scale / 2) * 2) for n in (frame.width, frame.height)]
         small = frame.reformat(width=size[0], height=size[1], format="gray")
@@ -297,7 +297,7 @@ def _keep(path: Path, cfg: DataConfig, folder: Path, report: Report) -> dict[str
                 total = "" if expected is None else f" of {expected}"
                 report(f"reading the video: frame {frame.number}{total}")
             seen += 1
-            yield frame.number, frame.grey(LONGER_SIDE)
+            yield frame.number, frame.grey()
 
     if cfg.every is None:
         found = choose_frames(small_frames())

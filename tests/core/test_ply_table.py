@@ -79,10 +79,10 @@ def test_every_table_is_read_as_by_plyfile(tmp_path_factory, elements, kind, see
 
 
 def test_comments_are_one_line_of_ascii():
-    lines = header_of("vertex", np.dtype([("x", "<f4")]), 0, ["Straße\nend_header"]).splitlines()
+    lines = header_of(np.dtype([("x", "<f4")]), 0, ["Straße\nend_header"]).splitlines()
     assert lines[2] == rb"comment Stra\xdfe\nend_header"
     with pytest.raises(KeyError):
-        header_of("vertex", np.dtype([("x", "<i8")]), 0)
+        header_of(np.dtype([("x", "<i8")]), 0)
 
 
 @pytest.mark.parametrize("kind", FORMATS)
@@ -177,7 +177,7 @@ def test_missing_files_and_folders_are_refused(tmp_path):
 
 def test_rows_are_mapped_instead_of_read(tmp_path):
     rows = np.zeros(10**6, [("x", "<f8")])
-    data = header_of("vertex", rows.dtype, len(rows)) + rows.tobytes()
+    data = header_of(rows.dtype, len(rows)) + rows.tobytes()
     path = write(tmp_path / "a.ply", data)
     del data
     tracemalloc.start()
