@@ -322,8 +322,6 @@ class DensifyConfig:
     """Opacity below which Gaussians are removed or relocated (3DGS)."""
     prune_scale: float = 0.1
     """Scale, scene extents, above which Gaussians are removed after the first reset (3DGS)."""
-    growth: float = 1.0
-    """Smallest growth factor of `mcmc` (3DGS-MCMC: 1.05); 1: even growth (ours: BUILD_NOTES)."""
     noise: float = 5e5
     """Scale of the MCMC noise on the means, times their learning rate (3DGS-MCMC)."""
     spread: float = 0.5

@@ -158,7 +158,7 @@ class Mcmc:
         growth_left = max((limit or alive) / max(alive, 1), 1.0)
         # The last event reaches the limit: Gaussians born earlier would cost time in more steps.
         events = (self.cfg.densify.stop - now.host.progress) / now.interval
-        factor = max(self.cfg.densify.growth, growth_left ** (1 / max(events, 1.0)))
+        factor = growth_left ** (1 / max(events, 1.0))
         return min(math.ceil(alive * factor), limit or alive)
 
     def _affordable(self, alive: int, now: Event) -> int | None:
