@@ -1,4 +1,4 @@
-"""Power and logarithm that stay finite over all of float32, sRGB, and small numeric helpers."""
+"""A logarithm that stays finite over all of float32, sRGB, and small numeric helpers."""
 
 from __future__ import annotations
 
@@ -53,11 +53,6 @@ def safe_log(x: Values, floor: float) -> Values:
     xp = namespace(x)
     below = x <= floor
     return xp.where(below, math.log(floor), xp.log(xp.where(below, 1.0, x)))
-
-
-def positive_pow(x: Values, p: Scalar, floor: float) -> Values:
-    """Return max(x, floor)^p through exp(p log x); the gradient to x is zero up to the floor."""
-    return namespace(x, p).exp(p * safe_log(x, floor))
 
 
 def unit_clip(x: Array) -> Array:

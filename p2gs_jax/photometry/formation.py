@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from p2gs_jax.config import CameraFormation, PhotometryConfig
-from p2gs_jax.core.numerics import Scalar, Values, namespace, positive_pow, safe_log
+from p2gs_jax.core.numerics import Scalar, Values, namespace, safe_log
 from p2gs_jax.photometry.appearance import Correction, Formation, corrected
 from p2gs_jax.photometry.response import DARKEST, UNKNOWN, decode, encode
 from p2gs_jax.types import GAMMA_SRGB, Array, Capture
@@ -40,12 +40,12 @@ def eotf(encoded: Values, curve: str) -> Values:
     """Return linear values of the base curve's encoding, on [0, inf)."""
     if curve == "linear":
         return encoded
-    if curve == "power":
-        return positive_pow(encoded, GAMMA_SRGB, 1e-3)
     xp = namespace(encoded)
+    if curve == "power":
+        return xp.exp(GAMMA_SRGB * safe_log(encoded, 1e-3))
     toe = encoded <= SRGB_ENCODED_END
     base = (xp.where(toe, 1.0, encoded) + 0.055) / 1.055
-    return xp.where(toe, encoded / 12.92, positive_pow(base, 2.4, 1e-3))
+    return xp.where(toe, encoded / 12.92, xp.exp(2.4 * xp.log(base)))
 
 
 def camera_rows(names: Sequence[str], cfg: PhotometryConfig) -> tuple[int, ...] | None:
