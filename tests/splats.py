@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 
-from p2gs_jax import Camera, DisplayTransform, Gaussians
+from p2gs_jax import Camera, DisplayTransform, Gaussians, Render
 from p2gs_jax.config import PhotometryConfig
 
 SRGB = DisplayTransform(1.0, 2.2, PhotometryConfig())
@@ -45,3 +45,9 @@ def camera(x=0.0, width=40, height=32, focal=30.0, yaw=0.0):
     viewmat[:3, 3] = -viewmat[:3, :3] @ [x, 0, 0]
     K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]], np.float32)
     return Camera(jnp.asarray(viewmat), jnp.asarray(K), width, height)
+
+
+def rendered(linear, alpha=None, depth=None):
+    """Return a render of these images, opaque by default."""
+    alpha = jnp.ones(linear.shape[:2]) if alpha is None else alpha
+    return Render(linear, alpha, depth, jnp.int32(0), jnp.bool_(False), jnp.zeros(0, bool))

@@ -99,3 +99,8 @@ def noise_scene(folder, train, held_out, masked=False):
         views.append(View(name, path, "0", pose, K, 40, 34, split=split, mask_path=mask))
     points = np.zeros((0, 3), np.float32)
     return Scene(folder, "colmap", tuple(views), points, points.astype(np.uint8))
+
+
+def contents(root):
+    """Return the bytes of all files below a folder, and False for its folders."""
+    return {path: path.is_file() and path.read_bytes() for path in root.rglob("*")}

@@ -9,6 +9,7 @@ import signal
 import cv2
 import numpy as np
 import pytest
+from tiny_scene import contents
 
 from p2gs_jax.cli.experiments import Synth
 from p2gs_jax.cli.shared import has_viewer, parse_duration
@@ -225,10 +226,6 @@ def folder(tmp_path_factory, finished_run):
     cfg["train"]["seed"] = 7
     (root / "other" / "config.json").write_text(json.dumps({"scene": "s", "fit": cfg}))
     return root
-
-
-def contents(root):
-    return {path: path.is_file() and path.read_bytes() for path in root.rglob("*")}
 
 
 @pytest.mark.parametrize(("words", "remedy"), WRONG)

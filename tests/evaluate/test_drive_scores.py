@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import splats
 from made_drive import FAR, SPEED, WALL, make_recording
-from splats import random_splats
+from splats import random_splats, rendered
 
 from p2gs_jax import DisplayTransform, develop, evaluate
 from p2gs_jax.config import DataConfig, FitConfig, LossConfig, PhotometryConfig
@@ -19,7 +19,7 @@ from p2gs_jax.scene.drives.assemble import assemble
 from p2gs_jax.scene.pixels.store import ImageStore
 from p2gs_jax.scene.rigid import headings
 from p2gs_jax.scene.split import assign_split
-from p2gs_jax.types import Lidar, Params, Photometry, Render, Scene, Tracks, View
+from p2gs_jax.types import Lidar, Params, Photometry, Scene, Tracks, View
 
 UP = np.array([0.0, 0.0, 1.0])
 
@@ -53,8 +53,8 @@ def metrics(scene):
 
     def render(gaussians, alive, camera, *args):
         depth, alpha = corridor(camera, np.array(scene.origin))
-        arrays = map(jnp.asarray, (0.16 * np.ones((*depth.shape, 3), np.float32), alpha, depth))
-        return Render(*arrays, jnp.int32(0), jnp.bool_(False), alive)
+        linear = 0.16 * np.ones((*depth.shape, 3), np.float32)
+        return rendered(*map(jnp.asarray, (linear, alpha, depth)))
 
     zeros = jnp.zeros(len(scene.train_indices))
     params = Params(random_splats(0, degree=0), Photometry(zeros, zeros, "log"))
@@ -222,8 +222,7 @@ def test_halves_lie_on_the_side_of_their_camera_and_match_after_development():
     ones = jnp.ones((SIZE, SIZE))
 
     def render(camera):
-        black, dead = jnp.zeros((SIZE, SIZE, 3)), jnp.zeros(0, bool)
-        return Render(black, ones, DEPTH * ones, jnp.int32(0), jnp.array(False), dead)
+        return rendered(jnp.zeros((SIZE, SIZE, 3)), ones, DEPTH * ones)
 
     # The second photograph reaches farther left.
     picture = seams.seam_picture(first, second, COMMON, render)

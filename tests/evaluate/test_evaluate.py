@@ -9,10 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from lpips_files import made_weights
-from splats import random_splats
+from splats import random_splats, rendered
 from tiny_scene import noise_scene
 
-from p2gs_jax import Params, Photometry, Render, UserError, evaluate, load_run
+from p2gs_jax import Params, Photometry, UserError, evaluate, load_run
 from p2gs_jax.cli.tables import print_metrics
 from p2gs_jax.config import FitConfig, LossConfig
 from p2gs_jax.core.numerics import srgb_encode
@@ -38,8 +38,7 @@ def judged(scene, *, slope=0.0, **options):
     def shaded(gaussians, alive, camera):
         flat = jnp.ones((camera.height, camera.width), jnp.float32)
         across = jnp.linspace(1 - slope, 1 + slope, camera.width)
-        linear = 0.2 * jnp.tile((flat * across)[..., None], 3)
-        return Render(linear, flat, flat, jnp.int32(0), jnp.bool_(False), alive)
+        return rendered(0.2 * jnp.tile((flat * across)[..., None], 3), depth=flat)
 
     return evaluate(
         Params(random_splats(0, degree=0), Photometry(jnp.zeros(2), jnp.zeros(2), "log"), None),
@@ -191,8 +190,7 @@ def test_held_out_views_are_scored_under_the_metering_of_training_views(tmp_path
 
     def render(gaussians, alive, camera):
         flat = jnp.ones((camera.height, camera.width), jnp.float32)
-        linear = camera.viewmat[0, 3] * jnp.tile(flat[..., None], 3)
-        return Render(linear, flat, flat, jnp.int32(0), jnp.bool_(False), alive)
+        return rendered(camera.viewmat[0, 3] * jnp.tile(flat[..., None], 3), depth=flat)
 
     logs = jnp.log(jnp.asarray(KEY / levels if metered else drawn))
     params = Params(random_splats(0, degree=0), Photometry(logs, jnp.zeros(24), "log"), None)

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from lpips_files import install, made_weights, package
+from scene.helpers import Malicious
 from tiny_scene import make_scene
 
 from p2gs_jax.errors import UserError
@@ -80,16 +81,6 @@ def test_pretrained_weights_give_what_the_authors_package_gives(net, moved, nois
         assert float(lpips(weights, b, b, everywhere)) < ROUNDING
 
 
-class Trap:
-    """Unpickling it leaves a trace."""
-
-    def __init__(self, path):
-        self.path = path
-
-    def __reduce__(self):
-        return Path.touch, (self.path,)
-
-
 def test_weights_come_from_the_package_and_wrong_names_are_refused(weights, monkeypatch, tmp_path):
     install(monkeypatch, tmp_path, package("alex"))
     a, b, mask = images()
@@ -110,12 +101,12 @@ def test_weights_come_from_the_package_and_wrong_names_are_refused(weights, monk
     ],
 )
 def test_a_package_that_is_missing_or_damaged(monkeypatch, tmp_path, content, words):
-    trap = Trap(tmp_path / "sprung")
+    trap = Malicious(Path.touch, (tmp_path / "sprung",))
     install(monkeypatch, tmp_path, content(trap))
     with pytest.raises(UserError, match=words) as error:
         read_lpips_weights("alex")
     assert "p2gs-jax[lpips]" in (error.value.fix or "")
-    assert not trap.path.exists()
+    assert not (tmp_path / "sprung").exists()
 
 
 def test_images_too_small_for_lpips_are_refused_before_a_fit(monkeypatch, tmp_path, refused):

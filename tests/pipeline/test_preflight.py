@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from jax.errors import JaxRuntimeError
 from run.test_checkpoint import flip
-from tiny_scene import make_scene, prepared
+from tiny_scene import contents, make_scene, prepared
 
 import p2gs_jax
 from p2gs_jax import DivergenceError, FitConfig, RenderConfig, UserError, with_fields
@@ -107,10 +107,10 @@ def test_a_run_is_not_continued_with_other_inputs(finished_run, tmp_path, refuse
     else:
         model = scene / "sparse" / "0" / "cameras.txt"
         model.write_text(model.read_text().replace("90.0", "91.0"))
-    files = {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
+    files = contents(run)
     text = refused("fit", scene, "--out", run, *FIT, "--steps", "70", "--resume")
     assert "begun with other photographs" in text
-    assert files == {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
+    assert files == contents(run)
 
 
 def test_a_run_is_recognised_by_the_content_of_its_known_exposures(tmp_path):
@@ -261,10 +261,10 @@ def test_a_run_stays_as_it_is_if_its_checkpoints_cannot_be_read(finished_run, tm
     shutil.copytree(finished_run, run)
     for path in run.glob("checkpoints/*/state.npz"):
         flip(path)
-    files = {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
+    files = contents(run)
     text = refused("fit", scene, "--out", run, *FIT, "--steps", "70", "--resume")
     assert "cannot be read" in text
-    assert {path: path.read_bytes() for path in run.rglob("*") if path.is_file()} == files
+    assert contents(run) == files
 
 
 def test_a_finished_run_without_checkpoints_is_not_begun_anew(finished_run, tmp_path, refused):

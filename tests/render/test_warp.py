@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import splats
 
-from p2gs_jax import Render, RenderConfig
+from p2gs_jax import RenderConfig
 from p2gs_jax.render import warp as warping
 from p2gs_jax.render.project import view_radiance
 
@@ -70,8 +70,7 @@ def test_hidden_and_empty_surfaces_and_those_behind_are_not_seen():
 
 def test_surface_depth_divides_by_alpha_and_needs_opacity():
     alpha = jnp.array([[0.98, 0.5]])
-    rest = jnp.int32(0), jnp.array(False), jnp.zeros(0, bool)
-    render = Render(jnp.zeros((1, 2, 3)), alpha, 7.0 * alpha, *rest)
+    render = splats.rendered(jnp.zeros((1, 2, 3)), alpha, 7.0 * alpha)
     np.testing.assert_allclose(surface_depth(render), [[7.0, 0.0]], rtol=1e-6)
     np.testing.assert_array_equal(surface_depth(render, 0.985), 0.0)
     with pytest.raises(ValueError, match="with_depth"):

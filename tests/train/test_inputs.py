@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
+from splats import rendered
 from tiny_scene import make_scene
 
 from p2gs_jax import load_scene, loss_terms
@@ -15,7 +16,7 @@ from p2gs_jax.scene.pixels.store import ImageStore
 from p2gs_jax.train import inputs
 from p2gs_jax.train.image_gradient import compared, decoded
 from p2gs_jax.train.inputs import TrainingViews, batches_of, stacked
-from p2gs_jax.types import Batch, Camera, Photometry, Render
+from p2gs_jax.types import Batch, Camera, Photometry
 
 
 def test_batches_hold_photographs_as_integers(tmp_path):
@@ -97,11 +98,9 @@ def test_a_photograph_on_a_larger_canvas_has_the_same_loss():
         shape = (14 + below, 17 + right)
         padded = rng.random((*shape, 3), np.float32)
         padded[:14, :17] = linear
-        alpha = jnp.ones(shape)
-        render = Render(padded, alpha, None, jnp.int32(0), jnp.bool_(False), jnp.zeros(0, bool))
         photograph = (np.pad(a, [(0, below), (0, right), (0, 0)][: a.ndim]) for a in (ldr, mask))
         view = Camera(jnp.eye(4), jnp.eye(3), *shape[::-1])
         batch = Batch(view, *photograph, jnp.int32(0), size=size)
-        rendered, target = compared(render, batch, photometry, None, cfg)
-        found.append({name: terms[name](rendered, target, None) for name in ("l1", "dssim")})
+        shown, target = compared(rendered(padded), batch, photometry, None, cfg)
+        found.append({name: terms[name](shown, target, None) for name in ("l1", "dssim")})
     chex.assert_trees_all_close(*found, rtol=1e-5)

@@ -7,13 +7,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from splats import rendered
 
 from p2gs_jax import DisplayTransform, develop, loss_terms, preset
 from p2gs_jax.config import FitConfig, LossConfig, PhotometryConfig
 from p2gs_jax.evaluation.alignment import fit_exposure
 from p2gs_jax.photometry.formation import formation
 from p2gs_jax.train.image_gradient import compared
-from p2gs_jax.types import Batch, Camera, Capture, Photometry, Render
+from p2gs_jax.types import Batch, Camera, Capture, Photometry
 
 RNG = np.random.default_rng(0)
 SIZE = (12, 14)
@@ -27,9 +28,8 @@ BACKDROPS = [(1.0, 1.0, 1.0), (0.0, 0.0, 0.0), (0.2, 0.7, 0.4)]
 
 def render_of(radiance, alpha):
     """Return a render of surfaces of a radiance that cover `alpha` of each pixel."""
-    none, zero = jnp.zeros(0, bool), jnp.int32(0)
     linear = jnp.asarray(radiance * alpha[..., None], jnp.float32)
-    return Render(linear, jnp.asarray(alpha, jnp.float32), None, zero, jnp.bool_(False), none)
+    return rendered(linear, jnp.asarray(alpha, jnp.float32))
 
 
 def batch_of(color, alpha, backdrop, mask=None):

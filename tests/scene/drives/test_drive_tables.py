@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from scene.drives.writers_pandaset import as_published
-from scene.helpers import refused
+from scene.helpers import Malicious, refused
 
 from p2gs_jax.scene.drives.tables import read_feather, read_pickled, read_rows
 
@@ -86,14 +86,6 @@ def test_tables_that_pandas_pickled_are_read(tmp_path, protocol, variant):
         else:
             for ours, theirs in zip(found, expected, strict=True):
                 assert ours == theirs or (pd.isna(ours) and pd.isna(theirs)), name
-
-
-class Malicious:
-    def __init__(self, *call):
-        self.call = call
-
-    def __reduce__(self):
-        return self.call
 
 
 SYSTEM = Malicious(os.system, ("touch malicious",))

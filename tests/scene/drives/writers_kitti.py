@@ -124,6 +124,16 @@ def box(place) -> np.ndarray:
     return small([20, 0, 0], [*place, -0.5])
 
 
+def tracks(ats, box, clock=0.0) -> dict:
+    """Return the truth of boxes at times; `box` places them in the scanner's axes."""
+    late = {"ahead": 0, "right": 0.25 * TURN}
+
+    def box_at(time, place):
+        return scanner(time + late["right"] * (place == w.RIGHT)) @ box(place)
+
+    return w.tracks(ats, late, box_at, clock)
+
+
 def write(root: Path, frames=3) -> w.Made:
     """Write a drive below the folder of a date."""
     date = root / DATE
@@ -151,11 +161,6 @@ def write(root: Path, frames=3) -> w.Made:
     things["parked"] = [[*s, yaw - 0.3 * at] for s, at in zip(stands, ats, strict=True)]
     boxes = tracklets(*(tracklet(name, 0, rows) for name, rows in things.items()))
     w.write_bytes(date / BOXES, boxes)
-    delays = {"ahead": 0, "right": 0.25 * TURN}
-
-    def box_at(time, place):
-        return scanner(time + delays["right"] * (place == w.RIGHT)) @ box(place)
-
     return w.Made(
         root=date,
         photographs={
@@ -165,7 +170,7 @@ def write(root: Path, frames=3) -> w.Made:
         },
         sweeps=list(BEGIN + forward),
         error=lambda points: w.off_landmarks(points, w.car_at(0)[:3, 3]),
-        boxes=w.tracks(forward, delays, box_at, BEGIN),
+        boxes=tracks(forward, box, BEGIN),
         tables=[Path(f"calib_{name}.txt") for name in ("cam_to_cam", "velo_to_cam", "imu_to_velo")]
         + [Path(DRIVE) / folder / "timestamps.txt" for folder in ("oxts", "image_03")],
         optional=[BOXES],

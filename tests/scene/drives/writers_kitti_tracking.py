@@ -46,11 +46,6 @@ def write(root: Path, frames=3) -> w.Made:
         labels += label(k, 2, "parked", raw.local_when_passed(parked[:3, 3], at))
         labels += f"{k} -1 DontCare -1 -1 -10 1 2 3 4 -1 -1 -1 -1000 -1000 -1000 -10\n"
     w.write_bytes(root / LABELS, labels)
-    delays = {"ahead": 0, "right": 0.25 * raw.TURN}
-
-    def box_at(time, place):
-        return raw.scanner(time + delays["right"] * (place == w.RIGHT)) @ box(place)
-
     return w.Made(
         root=root,
         photographs={
@@ -58,7 +53,7 @@ def write(root: Path, frames=3) -> w.Made:
         },
         sweeps=list(ats),
         error=lambda points: w.off_landmarks(points, w.car_at(0)[:3, 3]),
-        boxes=w.tracks(ats, delays, box_at),
+        boxes=raw.tracks(ats, box),
         tables=[CALIBRATION, OXTS],
         optional=[LABELS],
         scans=[SET / f"velodyne/{SEQUENCE}/{k:06d}.bin" for k in range(frames)],
