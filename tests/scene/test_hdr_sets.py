@@ -103,6 +103,13 @@ def test_models_of_one_exposure_get_the_others_of_each_pose(tmp_path):
     assert radiance_of(scene) == [None] * 3 + [3.0] * 3
     np.save(root / "poses_bounds_exps.npy", np.c_[rows(5), [1.0] * 5])
     assert "has 5 rows, but" in find_scene(root, CFG).notes[-1]
+    # All photographs may be in the model.
+    root = tmp_path / "whole"
+    helpers.write_tiny_model(root, n=4)
+    np.save(root / "poses_bounds_exps.npy", np.c_[rows(), [*TIMES, 1.0]])
+    scene = find_scene(root, CFG)
+    assert scene.format == "colmap"
+    assert [view.exif_ev for view in scene.views] == [-2.0, 0.0, 2.0, 0.0]
 
 
 def test_settings_of_raw_photographs_are_read(tmp_path):
@@ -144,6 +151,10 @@ def test_brackets_of_tables_are_held_out_whole(tmp_path):
     scene = split_scene(find_scene(tmp_path, CFG), DataConfig(test_every=2))
     assert [v.split for v in scene.views] == ["test"] * 3 + ["train"] * 3 + ["test"] * 3
     assert scene.split_by == "every 2nd bracket of each camera"
+    assert [v.exif_ev for v in scene.views] == [-2.0, 0.0, 2.0] * 3
+    np.save(path, np.c_[rows(9), [1, 1, 0] * 3])
+    with helpers.refused("row 2 has the impossible exposure 0"):
+        find_scene(tmp_path, CFG)
     for broken, why in ((table[:5], "has 5 rows, but"), (table[:, 1:], "holds 9x17 numbers, not")):
         np.save(path, broken)
         with helpers.refused(f"poses_bounds_exps.npy {why}"):

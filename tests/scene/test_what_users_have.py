@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 from scene import helpers
 from scene.test_split import write_ply
-from scene.test_transforms import LENS, OPENGL, frames, rows, write, write_llff
+from scene.test_transforms import LENS, OPENGL, frames, write
 
 from p2gs_jax.config import DataConfig
 from p2gs_jax.export.folders import write_folder
@@ -309,21 +309,7 @@ def test_cameras_differ_by_the_lenses_of_frames(tmp_path):
     assert {v.camera for v in find_scene(path, DataConfig(camera_by="one")).views} == {"0"}
 
 
-def test_exposures_of_hdr_nerf_and_held_out_frames_are_read(tmp_path):
-    root, table = tmp_path / "hdr", np.c_[rows(), [0.25, 1.0, 4.0, 1.0]]
-    write_llff(root, table, folder="input_images")
-    (root / "poses_bounds.npy").rename(root / "poses_bounds_exps.npy")
-    scene = find_scene(root, CFG)
-    assert [view.exif_ev for view in scene.views] == [-2.0, 0.0, 2.0, 0.0]
-    # HDR-GS puts a COLMAP model beside the file of exposures.
-    helpers.write_tiny_model(tmp_path / "gs", n=4)
-    shutil.copy(root / "poses_bounds_exps.npy", tmp_path / "gs")
-    scene = find_scene(tmp_path / "gs", CFG)
-    assert scene.format == "colmap"
-    assert [view.exif_ev for view in scene.views] == [-2.0, 0.0, 2.0, 0.0]
-    np.save(root / "poses_bounds_exps.npy", np.c_[rows(), [1, 1, 0, 1]])
-    with helpers.refused("row 2 has the impossible exposure 0"):
-        find_scene(root, CFG)
+def test_held_out_frames_are_read(tmp_path):
     data = {**LENS, "frames": frames("images/a.png"), "test_frames": frames("images/b.png")}
     scene = find_scene(write(tmp_path, data), CFG)
     assert [view.split for view in scene.views] == ["train", "test"]
