@@ -115,14 +115,13 @@ def _judged(
 
     programs = {}
     for label, renders in others.items():
-        scores = judge_renders(renders, judge, on_progress)
-        names = list(scores["as_rendered"]["per_view"])
+        names = [judge.scene.views[row].name for row in sorted(renders.files)]
         programs[label] = {
             "folder": str(renders.folder),
             "layout": renders.layout,
             "views": len(names),
             "missing": list(renders.missing),
-            **scores,
+            **judge_renders(renders, judge, on_progress),
             "run": scores_of_run(metrics, names),
         }
     return {"version": 1, "programs": programs}

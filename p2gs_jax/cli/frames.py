@@ -154,8 +154,9 @@ def panoramas_of(options: Render, fitted: Run) -> Job:
     shown = [s for s in rig.steps if any(shot.view in allowed for shot in s.shots.values())]
     if options.trajectory == "drive":
         if len(shown) < 2:
-            why = f"A drive needs two time steps; --split {options.split} has {len(shown)}."
-            raise UserError(why, fix="use --trajectory views, or another --split")
+            why = f"A drive needs two time steps; --split {options.split} leaves {len(shown)}."
+            fix = "use --trajectory views" + ", or --split all" * (options.split != "all")
+            raise UserError(why, fix=fix)
         path = PosePath(np.stack([step.pose for step in shown]))
         along = path.evenly(options.frames)
         poses = path(along)

@@ -30,10 +30,17 @@ RUN_PROTOCOLS = ("averaged", "exposure_fitted")
 
 
 def check_renders(found: OtherRenders, store: ImageStore) -> OtherRenders:
-    """Read all renders once, so that errors (`OtherRenders.read`) precede long computations."""
+    """Read all renders once, so that errors precede long computations; return those to judge.
+
+    Views that masks hide are left out. UserError: all are, or see `OtherRenders.read`.
+    """
     for row in found.files:
         found.read(row, store.camera(row)[2:], over=store.backdrop is not None)
-    return found
+    files = {row: path for row, path in found.files.items() if store.get(row)[1].any()}
+    if not files:
+        why = f"masks hide every held-out view of which {found.folder} has a render."
+        raise UserError(why, fix="render other views, or leave out --against")
+    return replace(found, files=files)
 
 
 def judge_renders(
@@ -44,8 +51,8 @@ def judge_renders(
     """Return the scores of renders of held-out views; `found` comes from `check_renders`.
 
     They are `as_rendered` and `exposure_fitted`, as the protocols of `metrics.json`; with reference
-    photographs also `reference` with `as_rendered` and `scale_aligned`. Views that masks hide are
-    left out. Raises UserError: masks hide all views, or see `OtherRenders.read`.
+    photographs also `reference` with `as_rendered` and `scale_aligned`. Raises UserError: see
+    `OtherRenders.read`.
     """
 
     def light(row: int, shown: DisplayTransform) -> Light:
@@ -64,10 +71,7 @@ def judge_renders(
         ldr = develop(linear, fitted, alpha=alpha)
         return score(picture), {**score(ldr), "exposure": fitted.exposure}
 
-    rows = [row for row in sorted(found.files) if judge.store.get(row)[1].any()]
-    if not rows:
-        why = "masks hide every held-out view that was to be compared."
-        raise UserError(why, fix="render other views, or leave out --against")
+    rows = sorted(found.files)
     as_rendered, exposure_fitted = {}, {}
     for done, (row, (plain, fitted)) in enumerate(
         zip(rows, map_in_order(judged, rows), strict=True), 1

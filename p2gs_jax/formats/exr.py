@@ -39,15 +39,15 @@ def write_exr(
 ) -> None:
     """Write linear radiance, without exposure applied; docs/exports.md lists the header.
 
-    Colours and `alpha` (channel A) are 16-bit floats, unless a colour would overflow or 1 % of the
-    colours would lose digits.
+    Colours and `alpha` (channel A) are 16-bit floats, unless a colour would overflow, or more than
+    1 % of the positive values would lose digits.
     `depth` is camera z times alpha; channel Z holds expected depth as 32-bit floats. The header
     describes `transform`, `camera` and the EXIF settings `shot`.
     """
     linear = np.asarray(linear, np.float32)
     light = linear[linear > 0]
-    fits = np.all(np.abs(linear) <= HALF_MAX) and np.mean(light < HALF_MIN) <= DIM
-    pixel = np.float16 if fits or not light.size else np.float32
+    fits = np.all(np.abs(linear) <= HALF_MAX) and np.sum(light < HALF_MIN) <= DIM * light.size
+    pixel = np.float16 if fits else np.float32
     header: dict = {
         "compression": OpenEXR.ZIP_COMPRESSION,
         "type": OpenEXR.scanlineimage,

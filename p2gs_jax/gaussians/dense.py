@@ -152,7 +152,7 @@ def _candidates(row: int, near, flows: Flows, color: Tones, seed: int) -> Candid
         centers,
         depth.inverse[y, x],
         _normals(depth, frame.K, y, x),
-        np.exp(color.log_radiance(row, frame.ldr[y, x], places(centers, *grey.shape[::-1]))),
+        color.radiance(row, frame.ldr[y, x], places(centers, *grey.shape[::-1])),
         texture[y, x],
         float(depth.valid.mean()),
     )

@@ -45,19 +45,18 @@ class Tones(NamedTuple):
     photometry: Photometry
     formation: PhotometryConfig
 
-    def log_radiance(
+    def radiance(
         self,
         row: int,
         ldr: Float32[np.ndarray, "... 3"],
         positions: Float[np.ndarray, "... 2"] | None = None,
     ) -> Float32[np.ndarray, "... 3"]:
-        """Return log radiance of a training view's image, or of single pixels.
+        """Return the radiance of a training view's image, or of single pixels.
 
         Single pixels need `positions` if vignetting is modelled (photometry/formation.py:places).
         """
         capture = self.photometry.capture(row)
-        light = inverse_formation(ldr, capture, self.formation, positions)
-        return np.log(np.maximum(light, np.finfo(np.float32).tiny)).astype(np.float32)
+        return inverse_formation(ldr, capture, self.formation, positions).astype(np.float32)
 
 
 def rough_tones(tracks: Observations | None, count: int) -> Tones:
@@ -69,7 +68,7 @@ def rough_tones(tracks: Observations | None, count: int) -> Tones:
     """
     log_exposures = np.zeros(count)
     if tracks is None or not len(tracks.points):
-        return _factors(log_exposures)
+        return _srgb_tones(log_exposures)
     good = ((tracks.colors > 0.03) & (tracks.colors < 0.95)).all(1)  # neither black nor clipped
     z = base_log(tracks.colors[good], "srgb")[0].mean(1)
     views, points = tracks.views[good], tracks.points[good]
@@ -80,11 +79,10 @@ def rough_tones(tracks: Observations | None, count: int) -> Tones:
         off = np.clip(z - log_exposures[views] - mean[points], -1.0, 1.0)  # bounds outliers
         log_exposures = log_exposures + np.bincount(views, off, count) / per_view
         log_exposures -= log_exposures.mean()
-    return _factors(log_exposures)
+    return _srgb_tones(log_exposures)
 
 
-def _factors(log_exposures: Any) -> Tones:
-    """Return tones of the sRGB curve with these exposures."""
+def _srgb_tones(log_exposures: Any) -> Tones:
     return Tones(Photometry(log_exposures, 0 * log_exposures), PhotometryConfig())
 
 
@@ -145,7 +143,7 @@ class MatchImages:
         usable = (mask > 0) & (brightest < self.saturation) & (brightest > self.black)
         # Pixels next to clipped pixels contain some of their light.
         usable = cv2.erode(usable.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
-        luminance = np.exp(self.tones.log_radiance(row, ldr)) @ LUMINANCE
+        luminance = self.tones.radiance(row, ldr) @ LUMINANCE
         pose = viewmat.astype(np.float64), K.astype(np.float64)
         log_exposure = float(self.tones.photometry.log_exposures[row])
         return MatchImage(ldr, luminance, usable, *pose, log_exposure)

@@ -170,7 +170,7 @@ def merge(a: Gaussians, b: Gaussians) -> Gaussians:
 def photographed_colors(
     scene: Scene, store: ImageStore, photometry: Photometry, cfg: FitConfig
 ) -> Scene:
-    """Return a scene whose points have the mean radiance in the training photographs, as sRGB.
+    """Return a scene whose points have their mean radiance in the training photographs, as sRGB.
 
     The exposure is the geometric mean of the photographs. Points that no photograph sees get the
     median of the other points.

@@ -54,11 +54,6 @@ class Rig:
     mounts: dict[str, Shot]
     steps: tuple[TimeStep, ...]
 
-    @property
-    def poses(self) -> Poses:
-        """Rig-to-world poses at all time steps."""
-        return np.stack([step.pose for step in self.steps])
-
 
 def find_rig(shots: Sequence[Shot], views: Sequence[View]) -> Rig:
     """Return the rig of the cameras of a scene.

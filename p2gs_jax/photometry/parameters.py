@@ -77,7 +77,7 @@ def point_radiance(
     radiance = inverse_tone_map(colors, np.float32(GAMMA_SRGB), cfg.photometry)
     if solution is not None:
         known = np.exp(solution.point_log_radiance)
-        usual = radiance / np.exp(np.mean(solution.log_exposures))
+        usual = radiance / np.exp(np.mean(solution.log_exposures))  # known ones have any unit
         radiance = np.where(np.isfinite(known), known, usual)
     return radiance.astype(np.float32)
 

@@ -70,8 +70,9 @@ def solve_exposures(
             selection = dataclasses.replace(selection, reasons=kept.reasons)
         notes += [*selection.reasons, *selection.solution.warnings]
     elif cfg.photometry.known is not None:
-        why = f"{scene.root}: no point of a surface is seen by two photographs, so the light that "
-        why += "belongs to --known-exposures cannot be found."
+        unseen = "no point is seen by two photographs"
+        why = f"{scene.root}: {'seed points are random' if scene.random_seeds else unseen}, so "
+        why += "--known-exposures give no radiance."
         raise UserError(why, fix="leave the option out, or give a structure-from-motion model")
     decisions = decide(cfg, selection, kept)
     resolved = decisions.resolve(cfg)

@@ -106,8 +106,7 @@ def check_scene(
 def check_options(cfg: FitConfig) -> None:
     """Check the options that depend on each other.
 
-    UserError: the initial exposures contradict known exposures or the curve, or the appearance
-    contradicts the curve.
+    UserError: options contradict each other, or one would have no effect.
     """
     p, share = cfg.photometry, cfg.densify.spread
     if cfg.data.split not in (None, EVERY) and not cfg.data.test_every:
@@ -121,12 +120,9 @@ def check_options(cfg: FitConfig) -> None:
         why = "--photometry.start random, which some presets set, draws initial exposures "
         why += "and would ignore known ones."
         raise UserError(why, fix="leave out --known-exposures, or add --photometry.start tracks")
-    fixed = {"white-balance": p.white_balance == "camera", "vignetting": p.vignetting is not None}
-    fixed["responses"] = p.responses != "all"
-    given = [f"--photometry.{name}" for name, asked in fixed.items() if asked]
-    if given and p.start != "tracks":
-        why = f"{given[0]} has no effect: exposures are learned (--photometry.start random)."
-        raise UserError(why, fix=f"leave out {given[0]}, or add --photometry.start tracks")
+    if p.known is not None and p.parameterization == "linear":
+        why = "--photometry.parameterization linear raises exposures below 0.001, also known ones."
+        raise UserError(why, fix="add --photometry.parameterization log")
     if p.appearance == "ppisp" and curved:
         why = f"ppisp learns a whole camera; it does not combine with curve {p.curve!r}."
         raise UserError(why, fix=f"use --preset ppisp, or add {random}")
@@ -136,6 +132,14 @@ def check_options(cfg: FitConfig) -> None:
     if p.curve == "spline" and p.spline is None and p.start != "tracks":
         why = "the curve 'spline' has no values, because --photometry.start is random."
         raise UserError(why, fix="add --photometry.start tracks, or --photometry.spline VALUES")
+    solved = {"vignetting": None, "responses": "all"}  # options, and values that need no solution
+    solved |= {"white_balance": None} if p.white_balance == "camera" else {}
+    given = {name: value for name, value in solved.items() if getattr(p, name) != value}
+    if given and p.start != "tracks":
+        options = [f"--photometry.{name.replace('_', '-')}" for name in given]
+        why = f"{' and '.join(options)} would have no effect: --photometry.start is random."
+        plain = " ".join(f"{o} {value}" for o, value in zip(options, given.values(), strict=True))
+        raise UserError(why, fix=f"add --photometry.start tracks, or {plain}")
     if not curved and p.start == "tracks":
         why = "the curve 'linear' splats display values; it does not combine with solved exposures."
         fix = "add --photometry.start random, or use the preset ppisp or one of 3dgs*"

@@ -57,6 +57,15 @@ WRONG = [
         (f"fit castle --out run --preset paper --photometry.{option}", "--photometry.start tracks")
         for option in ("vignetting camera", "responses camera", "white-balance camera")
     ],
+    (
+        "fit castle --out run --preset ppisp_solved --photometry.start random "
+        "--photometry.curve srgb",
+        "or --photometry.vignetting None --photometry.responses all",
+    ),
+    (
+        "fit castle --out run --known-exposures file.txt --photometry.parameterization linear",
+        "add --photometry.parameterization log",
+    ),
     ("fit castle --out run --densify.spread 1", "for example 0.5"),
     ("fit castle --out run --preset bset", "choose paper, paper_appendix, robust"),
     ("fit castle --out run --blocks some", "'some' is not a whole number, and not auto"),

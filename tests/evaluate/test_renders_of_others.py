@@ -1,5 +1,6 @@
 """Renders of other programs: the view that a file shows, and the pixels that count."""
 
+from dataclasses import replace
 from typing import Any, cast
 
 import cv2
@@ -46,6 +47,23 @@ def test_numbered_renders_are_in_the_order_of_names(tmp_path):
     for folder in ("other", "linked"):
         found = check_renders(find_renders(tmp_path / folder, scene), store)
         assert judge_renders(found, judge(scene, store))["as_rendered"]["psnr"] > 100
+
+
+def test_views_that_masks_hide_are_not_judged(tmp_path):
+    scene, _ = made_scene(tmp_path / "scene", ("a.png", "b.png"))
+    (tmp_path / "other").mkdir()
+    for name in ("a.png", "b.png"):
+        cv2.imwrite(str(tmp_path / "other" / name), photograph(scene, name))
+    found, mask = find_renders(tmp_path / "other", scene), tmp_path / "mask.png"
+    cv2.imwrite(str(mask), np.zeros(SIZE[::-1], np.uint8))
+    a, b = (replace(scene.views[row], mask_path=mask) for row in sorted(found.files))
+    part, none = (
+        ImageStore((scene.views[0], a, last), FitConfig().data) for last in (scene.views[2], b)
+    )
+    scores = judge_renders(check_renders(found, part), judge(scene, part))
+    assert [*scores["as_rendered"]["per_view"]] == ["b.png"]
+    with pytest.raises(UserError, match="masks hide every held-out view of which"):
+        check_renders(found, none)
 
 
 def test_masked_pixels_do_not_count(tmp_path):

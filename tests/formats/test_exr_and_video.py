@@ -105,7 +105,13 @@ def test_the_header_holds_white_balance_and_vignetting(tmp_path):
 
 @pytest.mark.parametrize(
     ("value", "pixel"),
-    [(65504.0, np.float16), (65505.0, np.float32), (2.0**-14, np.float16), (6e-5, np.float32)],
+    [
+        (65504.0, np.float16),
+        (65505.0, np.float32),
+        (2.0**-14, np.float16),
+        (6e-5, np.float32),
+        (0.0, np.float16),
+    ],
 )
 def test_exr_switches_to_float_where_half_ends(tmp_path, value, pixel):
     linear = np.full((2, 3, 3), value, np.float32)

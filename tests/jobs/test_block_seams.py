@@ -61,11 +61,14 @@ def test_blocks_with_empty_cores_are_refused():
         merge_cores(cut, [away, dataclasses.replace(away, means=-away.means)])
 
 
-@pytest.mark.parametrize(("stops", "farther"), [(0.0, 0.0), (0.1, 0.0), (-0.25, 0.02)])
-def test_a_seam_is_measured_with_its_true_steps(two_views, stops, farther):
+@pytest.mark.parametrize(
+    ("stops", "farther", "light"),
+    [(0.0, 0.0, 0.3), (0.1, 0.0, 0.3), (-0.25, 0.02, 0.3), (0.1, 0.0, -7.7)],
+)
+def test_a_seam_is_measured_with_its_true_steps(two_views, stops, farther, light):
     store = ImageStore(two_views.views, DataConfig())
-    first = wall(0.3)
-    second = wall(0.3 + stops * np.log(2), depth=4.0 * (1 + farther))
+    first = wall(light)
+    second = wall(light + stops * np.log(2), depth=4.0 * (1 + farther))
     (seam,) = measure_seams(two_views, store, halves(), [first, second], CFG)
     assert seam.blocks == (0, 1)
     assert seam.views == 2
@@ -76,7 +79,7 @@ def test_a_seam_is_measured_with_its_true_steps(two_views, stops, farther):
 
 
 def test_radiance_is_compared_as_rendered(two_views):
-    """A fit that leaves 5 % of the background visible makes its Gaussians as much brighter."""
+    """A block that shows 6 % of the background has Gaussians that are 6 % brighter."""
     store, opaque, thin = ImageStore(two_views.views, DataConfig()), wall(0.3), wall(0.3)
     thin = dataclasses.replace(thin, opacity_logits=jnp.full_like(thin.opacity_logits, -0.5))
     render = make_renderer(CFG)

@@ -149,7 +149,8 @@ def test_stacks_of_several_sizes_or_with_broken_files_are_refused(tmp_path):
         cv2.imwrite(str(path), np.zeros((10, 10, 3), np.uint8))
     with pytest.raises(UserError, match="give larger photographs"):
         read_stack(tmp_path / "s")
-    (tmp_path / "s" / "zz.heic").touch()  # beside zz.png
+    for name in ("zz.heic", "merged.exr", "._a.CR2"):
+        (tmp_path / "s" / name).touch()
     (tmp_path / "s" / "zz.png").write_bytes(b"no image")
     with pytest.raises(UserError, match="cannot decode"):
         read_stack(tmp_path / "s")

@@ -79,12 +79,14 @@ def test_functions_refuse_what_commands_refuse(tmp_path, scene, command, field, 
     assert words in str(refused.value)
 
 
-def test_random_seeds_tell_no_exposures(tmp_path, scene, monkeypatch):
+def test_known_exposures_and_calibrate_refuse_random_seeds(tmp_path, scene, monkeypatch):
     known = tmp_path / "known.csv"
     known.write_text("image,exposure\n000.png,1\n")
     cfg = with_fields(FitConfig(), {"photometry.known": str(known)})
     found = dataclasses.replace(load(scene, tmp_path, cfg), random_seeds=True)
-    with pytest.raises(UserError, match="--known-exposures cannot be found"):
+    with pytest.raises(
+        UserError, match="seed points are random, so --known-exposures give no radiance"
+    ):
         prepared(found, cfg)
     monkeypatch.setattr(calibrate, "load_scene", lambda *_, **__: found)
     with pytest.raises(UserError, match="neither tracks nor points"):

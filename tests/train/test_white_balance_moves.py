@@ -57,7 +57,7 @@ def test_without_solved_exposures_only_white_balance_per_view_remains():
     assert likely(cfg, None, {}) == decided
     by_camera = with_fields(cfg, {"photometry.white_balance": "camera"})
     assert unsolved(Decisions.as_given(by_camera)).white_balance is None
-    # The spline of `ppisp_solved` is solved, too.
+    # Without a solution the spline of `ppisp_solved` has no values.
     splined = with_fields(cfg, {"photometry.curve": "spline"})
     assert unsolved(Decisions.as_given(splined)).curve == "srgb"
     values = with_fields(splined, {"photometry.spline": (0.0,) * len(KNOTS)})

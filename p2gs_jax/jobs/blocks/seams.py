@@ -1,8 +1,7 @@
 """Seams between blocks: differences of radiance and depth, and the merged scene.
 
 The blocks at a boundary render the same views. The median difference is a step; the rest is the
-difference between any two fits. Steps are up to 0.004 stop (experiments/results/
-2026-11-23-districts.md).
+difference between any two fits (experiments/results/2026-11-23-districts.md).
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ from p2gs_jax.types import Camera, Gaussians, Render, Scene
 MOST_VIEWS = 48
 # Pixels are compared where both blocks have at least this opacity.
 OPAQUE = 0.9
-DARKEST = 1e-3  # linear radiance; darker pixels count as this
+DARKEST = 1e-3  # share of the median radiance; darker pixels count as this
 # A view with fewer pixels of the strip is ignored.
 FEWEST_PIXELS = 50
 
@@ -100,8 +99,9 @@ def _compared(
         strip &= cut.blocks[number].holds(places, cut.margin)
     good = strip.reshape(depth.shape) & (alpha > OPAQUE) & (other_alpha > OPAQUE)
     good &= (depth > 0) & (other_depth > 0)
-    ratio = np.log2(np.maximum(other[good], DARKEST) / np.maximum(radiance[good], DARKEST))
-    return ratio, other_depth[good] / depth[good] - 1
+    both = np.stack([radiance[good], other[good]])
+    both = np.maximum(both, DARKEST * np.median(both)) if both.size else both
+    return np.log2(both[1] / both[0]), other_depth[good] / depth[good] - 1
 
 
 def merge_cores(cut: Cut, fitted: Sequence[Gaussians]) -> tuple[Gaussians, list[int]]:

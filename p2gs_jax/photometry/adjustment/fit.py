@@ -170,7 +170,8 @@ def _exposures(
 ) -> tuple[dict[str, np.ndarray], Float[np.ndarray, "v x"], Bool[np.ndarray, " v"]]:
     """Return exposures, gammas, white balance and errors; gauge shifts; views without errors.
 
-    `level` is the mean log exposure of each view's component, or of a view that is not solved.
+    `level` is the log exposure of views that are not solved, and the mean log exposure of a
+    component without known exposures; it is 0 elsewhere.
     """
     a, light = fit.theta.a, fit.theta.b / fit.theta.a[:, None]
     h, balance = light.mean(1), light - light.mean(1, keepdims=True)

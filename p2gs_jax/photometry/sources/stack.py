@@ -14,7 +14,7 @@ from p2gs_jax.core.text import count_of
 from p2gs_jax.errors import broken
 from p2gs_jax.photometry.observations import Observations
 from p2gs_jax.photometry.sources.sampling import sample
-from p2gs_jax.scene.convert.readers import exif_evs
+from p2gs_jax.scene.convert.readers import CONVERTED_SUFFIXES, exif_evs
 from p2gs_jax.scene.files import IMAGE_SUFFIXES, undecodable
 from p2gs_jax.types import View
 
@@ -27,7 +27,7 @@ BLACKEST, SPIKE = 40, 0.3
 SIGNAL = 0.15  # least share of pixels with signal in a useful frame
 # Frames are searched for shifts of up to 2^SHIFT_BITS - 1 pixels; a larger one ends at this bound.
 SHIFT_BITS = 4
-SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp"}
+SUFFIXES = IMAGE_SUFFIXES - CONVERTED_SUFFIXES | {".webp"}
 
 Image = UInt8[np.ndarray, "h w 3"]
 
@@ -56,15 +56,17 @@ def read_stack(folder: Path) -> Stack:
     """Read the photographs of a folder (or of its `images/`).
 
     Raises UserError: no folder, fewer than two photographs, unreadable ones, different sizes, or
-    photographs that consist of margins or have a format that is not read here.
+    photographs that are too small or have a format that is not read here.
     """
     if not folder.is_dir():
         raise broken(folder, "is not a folder.", "name the folder of the photographs")
     inner = folder / "images" if (folder / "images").is_dir() else folder
-    found = sorted(p for p in inner.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES)
+    found = [p for p in sorted(inner.iterdir()) if p.name[0] != "."]
     files = [p for p in found if p.suffix.lower() in SUFFIXES]
-    # Raw files beside JPEG files of the same names may stay.
-    if others := [p for p in found if p.stem not in {q.stem for q in files}]:
+    # Raw files may lie beside their JPEG files, and a radiance map beside the photographs.
+    read = {p.stem for p in files}
+    ours = IMAGE_SUFFIXES - SUFFIXES - {".exr"}
+    if others := [p for p in found if p.suffix.lower() in ours and p.stem not in read]:
         fix = "convert it to JPEG, PNG or TIFF, or move it out of the folder"
         raise broken(others[0], "is a photograph that --static does not read.", fix)
     if len(files) < 2:

@@ -414,7 +414,7 @@ def _original(path: Path) -> Path:
         full_size = folder.parent / "images"
         if folder.name.startswith("images_") and full_size.is_dir():
             original = full_size / path.relative_to(folder)
-            # PIL knows suffixes of pictures; sidecars such as a.json may lie beside them.
+            # Sidecars such as a.json may lie beside photographs.
             pictures = CONVERTED_SUFFIXES | Image.registered_extensions().keys()
             others = sorted(original.parent.glob(glob.escape(original.stem) + ".*"))
             others = [p for p in others if p.suffix.lower() in pictures]

@@ -59,9 +59,10 @@ def drive_folder(root: Path, wanted: str | None, marker: str) -> Path:
     see `chosen_drive`.
     """
     if any(root.glob(marker)):
-        if wanted is not None and wanted not in root.resolve().name:
-            fix = "leave out --drive, or name the folder of all drives"
-            raise UserError(f"{root} is one drive, and its name has no {wanted!r}.", fix=fix)
+        names = root.name, root.resolve().name
+        if wanted is not None and not any(wanted in name for name in names):
+            why = f"{root} is one drive, whose name does not contain {wanted!r}."
+            raise UserError(why, fix="leave out --drive, or name the folder of all drives")
         return root
     drives = {path.relative_to(root).parts[0] for path in root.glob(f"*/{marker}")}
     return root / chosen_drive(wanted, sorted(drives), root)

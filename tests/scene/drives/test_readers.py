@@ -92,8 +92,10 @@ def test_one_of_several_drives_has_to_be_named(copied, read, name, part):
         read(first.parent, drive=part[:-1])
     with refused(f"no drive 'other'; there are {part}, {part}_other"):
         read(first.parent, drive="other")
-    with refused(f"{first} is one drive, and its name has no 'other'", "leave out --drive"):
-        read(first, drive="other")
+    with refused(f"{first} is one drive, whose name does not contain 'x'", "leave out --drive"):
+        read(first, drive="x")
+    (linked := first.with_name("linked")).symlink_to(first)
+    assert all(len(read(linked, drive=d).photographs) for d in (part, "linked"))
     other = read(first.parent, drive=f"{part}_o")
     assert len(other.photographs) == len(made.photographs)
     assert all(f"{part}_other" in str(p.path) for p in other.photographs)
