@@ -23,17 +23,15 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Float32
-from scipy.sparse import csr_array
 from scipy.spatial.transform import Rotation
 
 from p2gs_jax.config import LossConfig
 from p2gs_jax.core.numerics import evenly_spaced
-from p2gs_jax.gaussians.matching import visibility
+from p2gs_jax.gaussians.matching import shared_points, visibility
 from p2gs_jax.photometry.display import DisplayTransform, develop, undevelop
 from p2gs_jax.photometry.formation import inverse_tone_map, places
 from p2gs_jax.render.warp import project_points, sample_bilinear, surface_depth, unproject, warp
 from p2gs_jax.scene.rigid import camera_centers, moment_of, pose_of
-from p2gs_jax.scene.visibility import tracked
 from p2gs_jax.types import Camera, Render, Scene
 
 # Least number of shared pixels.
@@ -75,11 +73,7 @@ def neighbouring_pairs(scene: Scene, most: int) -> list[tuple[int, int]]:
     view with which it shares most points. There are at most `most` pairs, evenly spread over views.
     """
     train = scene.train_indices
-    seen = tracked(scene, train)
-    if seen is None:
-        seen = csr_array(visibility(scene, 0))
-    seen = seen.astype(np.float32)
-    shared = (seen @ seen.T).toarray()
+    shared = shared_points(visibility(scene, 0), len(scene.points))
     np.fill_diagonal(shared, 0)
     moments = [moment_of(scene.views[i]) for i in train]
     cameras = [scene.views[i].camera for i in train]

@@ -129,13 +129,13 @@ def _sampled(image, xy, interpolation=cv2.INTER_LINEAR):
 class Flows:
     """Flows between training views, computed on demand, in any thread.
 
-    `points` (scene units) give the initial flow; `seen` flags the points that each training view
+    `points` (scene units) give the initial flow; `seen` has the points that each training view
     sees. The last flows and their initial depths are cached.
     """
 
     images: MatchImages
     points: Float[np.ndarray, "p 3"]
-    seen: Bool[np.ndarray, "v p"]
+    seen: list[Int[np.ndarray, " _"]]
 
     def __post_init__(self):
         self._guide = lru_cache(KEPT_FLOWS)(

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, UInt8
+from scipy.sparse import csr_array
 
 from p2gs_jax.config import PhotometryConfig
 from p2gs_jax.core.streams import Stream, generator
@@ -166,49 +167,57 @@ def at_common_exposure(
     return first.astype(np.uint8), second.astype(np.uint8)
 
 
-def visibility(scene: Scene, seed: int) -> Bool[np.ndarray, "v p"]:
-    """Return whether each training view sees each point: from tracks, else from projection."""
-    rows = scene.train_indices
-    by_tracks = tracked(scene, rows)
+def visibility(scene: Scene, seed: int) -> list[Int[np.ndarray, " _"]]:
+    """Return the points that each training view sees: by tracks, else by projection."""
+    by_tracks = tracked(scene, scene.train_indices)
     if by_tracks is not None:
-        return by_tracks.toarray()
-    seen = np.zeros((len(rows), len(scene.points)), bool)
-    for row, index in enumerate(rows):
-        view = scene.views[index]
+        return np.split(by_tracks.indices, by_tracks.indptr[1:-1])
+    order = generator(seed, Stream.SHARED_POINTS).permutation(len(scene.points))
+    drawn, seen = np.sort(order[:MOST_POINTS]), []
+    for view in scene.training_views:
         xy, z = project_points(scene.points, view)
-        seen[row] = in_frame(xy, z, view.width, view.height)
-        if seen[row].sum() >= FEWEST_HIDING:
-            seen[row] = unoccluded(xy, z, view.width, view.height)
-    if len(scene.points) > MOST_POINTS:
-        rng = generator(seed, Stream.SHARED_POINTS)
-        seen[:, rng.permutation(len(scene.points))[MOST_POINTS:]] = False
+        shown = in_frame(xy, z, view.width, view.height)
+        if shown.sum() >= FEWEST_HIDING:
+            shown = unoccluded(xy, z, view.width, view.height)
+        seen.append(drawn[shown[drawn]])
     return seen
 
 
+def shared_points(seen: list[Int[np.ndarray, " _"]], count: int) -> Float32[np.ndarray, "v v"]:
+    """Return the numbers of points that two views see, of `count` points (`visibility`)."""
+    ends = np.cumsum([0, *map(len, seen)])
+    flags = np.ones(ends[-1], np.float32)
+    views = csr_array((flags, np.concatenate(seen), ends), shape=(len(seen), count))
+    return (views @ views.T).toarray()
+
+
 def neighbours(
-    scene: Scene, seen: Bool[np.ndarray, "v p"], log_exposures: Float[np.ndarray, " v"], count: int
+    scene: Scene,
+    seen: list[Int[np.ndarray, " _"]],
+    log_exposures: Float[np.ndarray, " v"],
+    count: int,
 ) -> list[Int[np.ndarray, " _"]]:
     """Return for every training view the rows of the `count` best views to match, best first.
 
-    `seen` flags the points that each view sees.
+    `seen` has the points that each view sees (`visibility`).
     """
     views = scene.training_views
     centers = camera_centers(views)
     score = np.zeros((len(views), len(views)))
-    shared = seen.astype(np.float32) @ seen.T.astype(np.float32)
+    shared = shared_points(seen, len(scene.points))
     for i in range(len(views)):
-        to_i = scene.points[seen[i]] - centers[i]
+        points = scene.points[seen[i]]
+        to_i = points - centers[i]
         to_i /= np.maximum(np.linalg.norm(to_i, axis=1, keepdims=True), 1e-12)
-        for j in np.flatnonzero(shared[i] >= FEWEST_SHARED):
-            if i == j:
-                continue
-            both = seen[j][seen[i]]
-            to_j = scene.points[seen[i]][both] - centers[j]
+        for j in np.flatnonzero(shared[i, :i] >= FEWEST_SHARED):
+            both = np.isin(seen[i], seen[j], assume_unique=True)
+            to_j = points[both] - centers[j]
             to_j /= np.maximum(np.linalg.norm(to_j, axis=1, keepdims=True), 1e-12)
             cosine = np.clip((to_i[both] * to_j).sum(1), -1, 1)
             angle = float(np.degrees(np.median(np.arccos(cosine))))
             fade = max(angle - WIDE, 0.0) / FADE
             score[i, j] = shared[i, j] * min(angle / NARROW, 1.0) * np.exp(-(fade**2))
+            score[j, i] = score[i, j]
     apart = np.abs(log_exposures[:, None] - log_exposures[None]) / EXPOSURE_FADE
     score *= np.exp(-(apart**2))
     best = np.argsort(-score, axis=1, kind="stable")[:, :count]
