@@ -169,9 +169,9 @@ def at_common_exposure(
 
 def visibility(scene: Scene, seed: int) -> list[Int[np.ndarray, " _"]]:
     """Return the points that each training view sees: by tracks, else by projection."""
-    by_tracks = tracked(scene, scene.train_indices)
-    if by_tracks is not None:
-        return np.split(by_tracks.indices, by_tracks.indptr[1:-1])
+    seen = tracked(scene, scene.train_indices)
+    if seen is not None:
+        return seen
     order = generator(seed, Stream.SHARED_POINTS).permutation(len(scene.points))
     drawn, seen = np.sort(order[:MOST_POINTS]), []
     for view in scene.training_views:

@@ -21,17 +21,17 @@ DEPTH_MARGIN = 0.05
 SHARE_VIEWS, SHARE_POINTS = 32, 20_000
 
 
-def tracked(scene: Scene, rows: Sequence[int] | Int[np.ndarray, " k"]) -> csr_array | None:
-    """Return whether each of some views sees each point by its tracks; None: there are no tracks.
-
-    `rows` are those of `scene.views`, in the order of the rows of the result.
-    """
+def tracked(
+    scene: Scene, rows: Sequence[int] | Int[np.ndarray, " k"]
+) -> list[Int[np.ndarray, " _"]] | None:
+    """Return the points that some views (`rows`) see by tracks; None: the scene has no tracks."""
     tracks = scene.tracks
     if tracks is None or not len(tracks.xy):
         return None
     where = tracks.view_indices, tracks.point_indices
     shape = len(scene.views), len(scene.points)
-    return csr_array((np.ones(len(tracks.xy), bool), where), shape=shape)[list(rows)]
+    seen = csr_array((np.ones(len(tracks.xy), bool), where), shape=shape)[list(rows)]
+    return np.split(seen.indices, seen.indptr[1:-1])
 
 
 def in_frame(

@@ -190,7 +190,7 @@ def seen_points(scene: Scene) -> list[Int[np.ndarray, " _"]]:
     rows = scene.train_indices
     seen = tracked(scene, rows)
     if seen is not None:
-        return np.split(seen.indices, seen.indptr[1:-1])
+        return seen
     picked = np.arange(0, len(scene.points), max(1, len(scene.points) // MOST_PROJECTED))
     return [picked[shows(scene.views[i], scene.points[picked])] for i in rows]
 
@@ -236,7 +236,7 @@ def _seen(scene: Scene, rows: Int[np.ndarray, " k"]) -> Bool[np.ndarray, " p"]:
     """Return the mask of points that any view sees: by tracks, else by projection into a few."""
     by_tracks, seen = tracked(scene, rows), np.zeros(len(scene.points), bool)
     if by_tracks is not None:
-        seen[by_tracks.indices] = True
+        seen[np.concatenate(by_tracks)] = True
         return seen
     for k in evenly_spaced(len(rows), MOST_LOOKED):
         seen |= shows(scene.views[rows[k]], scene.points)

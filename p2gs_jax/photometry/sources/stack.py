@@ -65,8 +65,8 @@ def read_stack(folder: Path) -> Stack:
     files = [p for p in found if p.suffix.lower() in SUFFIXES]
     # Raw files may lie beside their JPEG files, and a radiance map beside the photographs.
     read = {p.stem for p in files}
-    ours = IMAGE_SUFFIXES - SUFFIXES - {".exr"}
-    if others := [p for p in found if p.suffix.lower() in ours and p.stem not in read]:
+    unread = IMAGE_SUFFIXES - SUFFIXES - {".exr"}
+    if others := [p for p in found if p.suffix.lower() in unread and p.stem not in read]:
         fix = "convert it to JPEG, PNG or TIFF, or move it out of the folder"
         raise broken(others[0], "is a photograph that --static does not read.", fix)
     if len(files) < 2:

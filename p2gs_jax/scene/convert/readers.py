@@ -414,11 +414,12 @@ def _original(path: Path) -> Path:
         full_size = folder.parent / "images"
         if folder.name.startswith("images_") and full_size.is_dir():
             original = full_size / path.relative_to(folder)
+            if original.is_file():
+                return original
             # Sidecars such as a.json may lie beside photographs.
             pictures = CONVERTED_SUFFIXES | Image.registered_extensions().keys()
             others = sorted(original.parent.glob(glob.escape(original.stem) + ".*"))
-            others = [p for p in others if p.suffix.lower() in pictures]
-            return original if original.is_file() else next(iter(others), path)
+            return next((p for p in others if p.suffix.lower() in pictures), path)
     return path
 
 
