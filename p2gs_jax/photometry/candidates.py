@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from p2gs_jax.config import Level
 from p2gs_jax.core.numerics import LN2
@@ -127,8 +127,10 @@ class Search:
         self, problem: Problem, held: Bool[np.ndarray, " o"], few: Problem, *, known: bool
     ):
         self.fits: dict[Choice, tuple[Fit, Response]] = {}
-        self._problem, self._training, self._few = problem, problem.part(~held), few
-        o, self._held = problem.observations, held
+        o, self._held, self._few = problem.observations, held, few
+        self._training = problem.part(~held)
+        tied = _tied(problem, held, self._training.component)
+        self._problem = replace(problem, usable=problem.usable & tied[:, None])
         self._views, self._regions = o.views[held], clusters_of(o, problem.layout.row)[held]
         self._predicted: dict[Choice, Predicted] = {}
         self._errors: dict[Choice, np.ndarray] = {}  # of log exposures, for the best choices
@@ -296,6 +298,20 @@ class Search:
         known = np.isfinite(errors)
         units = change[known] / np.maximum(errors[known], SMALLEST_ERROR_EV * LN2)
         return float(np.sqrt(np.mean(units**2))) if known.any() else 0.0
+
+
+def _tied(
+    problem: Problem, held: Bool[np.ndarray, " o"], component: Int[np.ndarray, " v"]
+) -> Bool[np.ndarray, " o"]:
+    """Return whether observations belong to the component of the points' training observations.
+
+    The exposures of different components cannot be compared, so nothing predicts other ones.
+    """
+    o, seen = problem.observations, problem.usable.any(1) & ~held
+    label = component[o.views]
+    of_point = np.full(o.point_count, -1)
+    of_point[o.points[seen]] = label[seen]
+    return held <= (label == of_point[o.points])
 
 
 def _centred(values: Float[np.ndarray, "v ..."]) -> Float[np.ndarray, "v ..."]:

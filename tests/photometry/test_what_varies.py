@@ -8,6 +8,7 @@ from solving import DRIVE, ISO4, PLAIN, adjust, ev, problem_of, rms, select
 from synthetic_drive import make_drive, make_exposures, observe
 
 from p2gs_jax.evaluation.alignment import exposure_error
+from p2gs_jax.photometry import calibrate
 from p2gs_jax.photometry.adjustment.problem import KnownExposures
 from p2gs_jax.photometry.adjustment.solve import fit_response
 from p2gs_jax.photometry.candidates import Candidate, choose, mean_deficit
@@ -308,6 +309,28 @@ def test_values_whose_partners_are_held_out_are_not_used():
     assert alone.any()
     assert problem.usable[~held][alone].any()
     assert not kept.usable[alone].any()
+
+
+@pytest.mark.parametrize("lone", [False, True])
+def test_a_view_without_training_observations_decides_nothing(monkeypatch, lone):
+    """Gauges would leave its exposure free, and it would drift to 60 stops."""
+    by_regions = calibrate.held_out
+
+    def held_out(o, seed):
+        held = by_regions(o, seed)
+        mine = np.flatnonzero(o.views == 5)
+        held[mine] = True
+        if lone:
+            held |= o.points == o.points[mine[0]]
+            held[mine[0]] = False
+        return held
+
+    monkeypatch.setattr(calibrate, "held_out", held_out)
+    found = select(PLAIN)
+    assert found.solution.model == "view_exposure"
+    assert ev(found.solution) < 0.01
+    best = {c.form.model: c.deficit for c in reversed(found.candidates)}
+    assert best["view_exposure"] < 0.01 < 1 < best["constant"]
 
 
 def test_points_that_are_seen_twice_tell_what_varies():

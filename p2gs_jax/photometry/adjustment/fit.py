@@ -50,6 +50,7 @@ def fit_model(
     most = int(np.clip(MOST_SOLVED / max(o.view_count, 1), LEAST_PER_VIEW, PER_VIEW))
     pick = o.thinned(most, 0)
     few = problem if pick.all() else problem.part(pick)
+    problem = replace(problem, component=few.component)
     fit, system = solve_model(few, form, response, loss="whole_points")
     judged = (fit, system) if response.spline is None else with_free_curve(few, form, response, fit)
     return solution_of(problem, form, response, fit, uncertainty(*judged, few.observations))

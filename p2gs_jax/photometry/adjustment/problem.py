@@ -141,4 +141,6 @@ class Problem:
     def part(self, pick: np.ndarray | slice) -> Problem:
         """Return some of the observations, chosen by a mask or their rows."""
         some = self.observations.picked(pick)
-        return replace(self, observations=some, usable=some.shared(self.usable[pick]))
+        usable = some.shared(self.usable[pick])
+        # Fewer points may leave a view alone, and it needs a gauge of its own then.
+        return replace(self, observations=some, usable=usable, component=some.components(usable))
