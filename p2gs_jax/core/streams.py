@@ -40,6 +40,7 @@ class Stream(IntEnum):
     NETWORK = 79  # initial weights of the network of Luminance-GS
     SELF_CHECK = 83  # Gaussians of the rasterizer's self-check
     SCORE_SIGNS = 47  # signs of residuals for standard errors of many views
+    EQUAL_RESIDUALS = 89  # signs of residuals of one size, for the same
 
 
 @unique

@@ -168,8 +168,22 @@ def test_views_that_few_surfaces_determine_have_larger_errors():
     assert 1.3 < np.median(uncertainty(two, system, o).few) < 1.5
 
 
+@pytest.mark.parametrize(("parts", "most"), [(16, 1.2), (32, 2.5)])
+def test_views_that_few_points_tie_have_honest_errors(parts, most):
+    """Exposures absorb the residuals of weak ties: errors were up to 7 times the stated ones."""
+    ratios = []
+    for part in range(8):
+        s = adjust(PLAIN.picked(PLAIN.points % parts == part))
+        gap = s.log_exposures - np.log(ISO4)
+        for label in np.unique(s.component):
+            mine = s.component == label
+            if mine.sum() > 1:
+                ratios += list((gap[mine] - gap[mine].mean()) / s.exposure_errors[mine])
+    assert 0.8 < rms(ratios) < most
+
+
 def test_errors_of_exposures_include_the_uncertainty_of_a_fitted_curve():
-    o = observe(SMALL, ISO2, curve="filmic")
+    o = observe(DRIVE, ISO4, curve="filmic")
     curve = solve.fit_response(problem_of(o), Response())
     fit, system = solve.solve_model(problem_of(o), VIEW_EXPOSURE, curve, loss="whole_points")
     known = uncertainty(fit, system, o)
@@ -460,11 +474,11 @@ def two_groups() -> tuple[Observations, np.ndarray]:
 
 
 def test_a_thin_link_does_not_make_exposures_certain():
-    """Float32 sums left variances below zero here, which were reported as errors of exactly 0."""
+    """Float32 sums left variances below zero here, and one dark point is worth little anyway."""
     o, h = two_groups()
     s = adjust(o)
     assert len(set(s.component)) == 1
-    assert 5e-4 < s.exposure_errors.min() < s.exposure_errors.max() < 5e-3
+    assert 0.1 < s.exposure_errors.min() < s.exposure_errors.max() < 0.5
     assert rms((s.log_exposures - h + h.mean()) / s.exposure_errors) < 3
     assert s.unknown_errors == 0
 

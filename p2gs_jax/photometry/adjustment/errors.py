@@ -9,7 +9,7 @@ photographs of known exposure, and 3 to 7 times for drives with simulated shared
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -31,6 +31,7 @@ HELD = 1e-11
 # Number of random draws if unknowns are too many for their covariance: the relative error of a
 # standard error is then 12 %.
 DRAWS = 32
+GROUPS = 4096  # number of groups of observations with errors of random signs in such systems
 # Side of the regions whose points form a cluster, units of half an image's diagonal. Errors over
 # standard errors of photographs of known exposure: 2.1 if points are independent, 1.6 with regions
 # of this size, no better with larger ones (experiments/results/2026-11-22-camera-as-it-is.md).
@@ -50,8 +51,9 @@ LinearMap = Callable[[Parameters], Float[np.ndarray, "n c"]]
 class Uncertainty(NamedTuple):
     """The covariance of a solution."""
 
-    # Columns whose outer products sum to the covariance of all parameters.
-    roots: Float[np.ndarray, "d r"]
+    # Columns whose outer products sum to the covariance of all parameters, by the residuals of
+    # each cluster and by those of all observations together; the larger deviation counts.
+    roots: Sequence[Float[np.ndarray, "d r"]]
     # Directions that the observations do not determine and `roots` does not contain.
     unknown: Float[np.ndarray, "d k"]
     few: Float[np.ndarray, " v"]  # factors on the errors of views with few clusters
@@ -59,7 +61,8 @@ class Uncertainty(NamedTuple):
 
     def of(self, function: LinearMap) -> Float[np.ndarray, " n"]:
         """Return the standard deviations of a function of the parameters; inf: undetermined."""
-        deviation = np.linalg.norm(function(self.split(self.roots)), axis=1)
+        each = [np.linalg.norm(function(self.split(root)), axis=1) for root in self.roots]
+        deviation = np.max(each, 0)
         if not self.unknown.size:
             return deviation
         lost = (np.abs(function(self.split(self.unknown))) > CANCELLED).any(1)
@@ -73,6 +76,9 @@ def uncertainty(fit: Fit, system: System, observations: Observations) -> Uncerta
     independent: the meat is summed over clusters. It includes errors that regions of an image
     share. It also includes light that changes with the footprint, a pixel's width on the surface;
     every cluster has another slope.
+
+    Exposures absorb the residuals of a view, or of a link between views, that has few observations.
+    A second meat is therefore the information times the mean variance of all observations.
     """
     layout = fit.model.layout
     clusters = observations.cells
@@ -102,42 +108,63 @@ def uncertainty(fit: Fit, system: System, observations: Observations) -> Uncerta
     prior = priors.normal + system.smooth(fit.normal)
     bread = fit.normal * fit.at.curvature + prior
     gauges = system.gauges(bread)[1]
+    variance = _mean_variance(fit)
     if not is_small(system.basis.shape[1]):  # pyright: ignore
-        drawn = _drawn(Balanced(bread, gauges, system.basis), scores, priors)
+        each = np.sqrt(variance / np.maximum(fit.at.weight.sum(1), EMPTY))
+        each *= generator(0, Stream.EQUAL_RESIDUALS).choice([-1.0, 1.0], len(each))
+        groups = np.arange(len(each)) % GROUPS
+        alike = _shared_scores(fit.model, fit.theta, fit.at, groups, each)
+        drawn = _drawn(Balanced(bread, gauges, system.basis), (scores, alike), priors)
         return Uncertainty(*drawn, few, system.unknowns.split)
     # A prior is an observation with variance 1 / precision: its meat equals its bread.
-    meat = scores.T @ scores + prior
+    meats = scores.T @ scores + prior, variance * fit.normal + prior
     with one_thread():
         dense = whole(bread + gauges.T @ gauges)
-        return Uncertainty(*_sandwich(dense, meat, system.basis), few, system.unknowns.split)
+        return Uncertainty(*_sandwich(dense, meats, system.basis), few, system.unknowns.split)
 
 
-def _sandwich(bread, meat, basis) -> tuple[Float[np.ndarray, "d r"], Float[np.ndarray, "d k"]]:
+def _mean_variance(fit: Fit) -> float:
+    """Return the variance of an observation's residual in units of its inverse weight.
+
+    Radiances and exposures take degrees of freedom.
+    """
+    weight, layout = fit.at.weight, fit.model.layout
+    seen = weight.any(1)
+    free = seen.sum() - len(np.unique(layout.row[seen])) - len(np.unique(layout.views[seen]))
+    pulls = (weight * fit.at.residual).sum(1)
+    return float(pulls @ pulls / max(weight.sum(), EMPTY) * seen.sum() / max(free, 1))
+
+
+def _sandwich(bread, meats, basis) -> tuple[list[Float[np.ndarray, "d r"]], np.ndarray]:
     if not basis.nnz:
-        return np.zeros((len(bread), 1)), np.zeros((len(bread), 0))
+        return [np.zeros((len(bread), 1))], np.zeros((len(bread), 0))
     # Known exposures have much more information than pixels: directions are scaled to compare them.
     diagonal = (basis.T @ bread @ basis).diagonal()
     g = basis @ sp.diags_array(1 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0)))
     value, direction = np.linalg.eigh(whole(g.T @ bread @ g))
     determined = value > HELD
     inverse = (direction[:, determined] / value[determined]) @ direction[:, determined].T
-    size, across = np.linalg.eigh(whole(g.T @ meat @ g))
-    roots = inverse @ (across * np.sqrt(np.maximum(size, 0)))
+    roots = []
+    for meat in meats:
+        size, across = np.linalg.eigh(whole(g.T @ meat @ g))
+        roots.append(g @ (inverse @ (across * np.sqrt(np.maximum(size, 0)))))
     unknown = g @ direction[:, ~determined]
-    return g @ roots, unknown / np.linalg.norm(unknown, axis=0)
+    return roots, unknown / np.linalg.norm(unknown, axis=0)
 
 
 def _drawn(
     bread: Balanced, scores, priors: Held
-) -> tuple[Float[np.ndarray, "d r"], Float[np.ndarray, "d k"]]:
-    """Return solutions for clusters and priors with random signs (wild bootstrap)."""
-    rng = generator(0, Stream.SCORE_SIGNS)
-    counts = (scores.shape[0], len(priors.targets))
-    of_clusters, of_priors = (rng.choice([-1.0, 1.0], (n, DRAWS)) for n in counts)
-    right = scores.T @ of_clusters
-    right += priors.rows.T @ (np.sqrt(priors.precisions)[:, None] * of_priors)
+) -> tuple[list[Float[np.ndarray, "d r"]], Float[np.ndarray, "d k"]]:
+    """Return solutions for each kind of scores and priors with random signs (wild bootstrap)."""
+    rng, roots = generator(0, Stream.SCORE_SIGNS), []
+    for kind in scores:
+        counts = (kind.shape[0], len(priors.targets))
+        of_scores, of_priors = (rng.choice([-1.0, 1.0], (n, DRAWS)) for n in counts)
+        right = kind.T @ of_scores
+        right += priors.rows.T @ (np.sqrt(priors.precisions)[:, None] * of_priors)
+        roots.append(bread.solve(right) / np.sqrt(DRAWS))
     unknown = bread.unheld(HELD)
-    return bread.solve(right) / np.sqrt(DRAWS), unknown / np.linalg.norm(unknown, axis=0)
+    return roots, unknown / np.linalg.norm(unknown, axis=0)
 
 
 def regions(
