@@ -110,14 +110,29 @@ def test_the_same_photographs_give_the_same_inliers(folder, tmp_path):
 
 def test_a_dark_photograph_has_nearly_as_many_features_as_a_bright_one(folder, tmp_path):
     with Image.open(folder / "IMG (0).png") as bright:
-        bright.point(lambda value: value // 12).save(folder / "dark.png")
-    names = ["IMG (0).png", "dark.png"]
+        bright.point(lambda value: value // 12).save(folder / "A dark.png")
+    names = ["A dark.png", "IMG (0).png"]
     database = kept_features(tmp_path / "features", folder, {("one",): names}, print)
     with pycolmap.Database.open(database) as db:
         images = {image.name: image for image in db.read_all_images()}
-        bright, dark = (db.num_keypoints_for_image(images[n].image_id) for n in names)
+        dark, bright = (db.num_keypoints_for_image(images[n].image_id) for n in names)
     assert dark > 0.6 * bright > 100
-    assert images["dark.png"].camera_id == images["IMG (0).png"].camera_id
+    assert images["A dark.png"].camera_id == images["IMG (0).png"].camera_id
+    # Not in the order in which features were found: points would differ from run to run.
+    assert [images[n].image_id for n in names] == [1, 2]
+
+
+def test_photographs_of_a_run_that_ended_before_its_first_features_share_their_camera(
+    folder, tmp_path, monkeypatch
+):
+    names = [f"IMG ({k}).png" for k in range(3)]
+    with monkeypatch.context() as patch:
+        patch.setattr(pycolmap, "extract_features", lambda *_, **__: 1 / 0)
+        with pytest.raises(ZeroDivisionError):
+            kept_features(tmp_path / "features", folder, {("one",): names[1:]}, print)
+    database = kept_features(tmp_path / "features", folder, {("one",): names}, print)
+    with pycolmap.Database.open(database) as db:
+        assert {image.camera_id for image in db.read_all_images()} == {1}
 
 
 def test_only_new_photographs_are_processed_and_matches_judge_poses(noisy_street, folder, tmp_path):

@@ -87,19 +87,21 @@ def extract(
     if most_threads < available_cores():
         options.num_threads = max(1, most_threads)
     reader, threshold = pycolmap.ImageReaderOptions(), options.sift.peak_threshold
+    if camera is not None:
+        reader.existing_camera_id = camera
+    pycolmap.Database.open(database).close()
+    # Images get ids by name; otherwise in the order in which threads finish, and points are
+    # triangulated by ids.
+    pycolmap.import_images(database, image_folder, mode, names, reader)
     halvings = [_halvings(image_folder / name) for name in names]
     for each in sorted({*halvings}):
         part = [name for name, k in zip(names, halvings, strict=True) if k == each]
         options.sift.peak_threshold = threshold * 0.5**each
-        if camera is not None:
-            reader.existing_camera_id = camera
         try:
             pycolmap.extract_features(
                 database,
                 image_folder,
                 image_names=part,
-                camera_mode=mode,
-                reader_options=reader,
                 extraction_options=options,
                 device=pycolmap.Device.cpu,
             )
@@ -107,8 +109,6 @@ def extract(
             why = f"COLMAP could not extract features in {image_folder}: {error}."
             fix = "find an image there that does not open, and remove or replace it"
             raise UserError(why, fix=fix) from error
-        if camera is None and mode == pycolmap.CameraMode.SINGLE:
-            camera = _cameras(database).get(part[0])
 
 
 def _halvings(path: Path) -> int:
@@ -171,6 +171,8 @@ def kept_features(
         # A run that was killed while it matched leaves escaped names.
         _rename(database, _UNESCAPED)
     known = _cameras(database)
+    if not known:  # its images, if any, would keep their camera beside that of new ones
+        database.unlink(missing_ok=True)
     new = [name for name in names if name not in known]
     if len(new) < len(names):
         report(f"features of {len(names) - len(new)} images come from an earlier run")
