@@ -31,6 +31,9 @@ _ROWS = 256  # rows of a photograph that are converted at once
 BYTES_PER_PIXEL, SHARE = 40, 0.5
 # The largest relative difference between the aspect ratios of a mask and its photograph.
 _ASPECT_TOLERANCE = 0.01
+# The largest values of cameras with 10, 12 and 14 bits. A photograph of 16 bits is taken for one of
+# these if its largest value is one of them and is held by at least this share of its values.
+_SENSOR_WHITES, _CLIPPED = (1023, 4095, 16383), 1e-4
 # TIFF's tag for the meaning of the fourth channel; its colours are multiplied by associated alpha.
 _EXTRA_SAMPLES, _ASSOCIATED = 338, (1,)
 # The tags for the order of channels, and for how a photograph is shown: as stored (1), or turned.
@@ -244,7 +247,17 @@ def _read_raster(path: Path, *, colours: bool = False) -> np.ndarray:
         _require_plain(path, raw)
     if (of_tiff and raw.shape[2:] == (4,)) or (raw.ndim == 2 and has_alpha(path)):
         raw = _with_alpha(path, raw)
+    if colours:
+        _require_full_range(path, raw)
     return with_profile_applied(data, raw) if colours else raw
+
+
+def _require_full_range(path: Path, raw: UInt[np.ndarray, "..."]) -> None:
+    """Raise UserError for values of 10, 12 or 14 bits in 16 bits, whose white would be dark."""
+    most = raw.max()
+    if most in _SENSOR_WHITES and raw.dtype == np.uint16 and (raw == most).mean() > _CLIPPED:
+        why = f"has 16 bits, but its white is {most}: its values have {int(most).bit_length()} bits"
+        raise broken(path, why, f"multiply its values by 65535 / {most}")
 
 
 def _require_plain(path: Path, raw: UInt[np.ndarray, "..."]) -> None:

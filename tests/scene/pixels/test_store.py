@@ -111,6 +111,18 @@ def test_the_header_of_a_pgm_or_ppm_states_white(tmp_path, kind, white):
     np.testing.assert_allclose(ldr[0, 0] - values / white, 0, atol=1 / 255 if white < 256 else 1e-4)
 
 
+@pytest.mark.parametrize(("clipped", "accepted"), [(9, False), (1, True)])
+def test_values_of_12_bits_in_16_bits_are_refused(tmp_path, clipped, accepted):
+    raw = np.random.default_rng(0).integers(0, 4095, (120, 100, 3)).astype(np.uint16)
+    raw[:clipped, 0] = 4095
+    view = make_view(tmp_path / "a.png", raw)
+    if accepted:
+        decode.stored(view)
+    else:
+        with refused("a.png has 16 bits, but its white is 4095: its values have 12 bits"):
+            decode.stored(view)
+
+
 def test_sizes_and_intrinsics(tmp_path):
     view = make_view(tmp_path / "a.png", size=(1000, 751))
     assert size_at(view, None) == size_at(view, 2000) == (1000, 751)
