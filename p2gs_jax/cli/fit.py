@@ -276,6 +276,8 @@ class Calibrate:
             options = " and ".join(f"--{name.replace('_', '-')}" for name in changed)
             fix = f"leave out {options}, which would have no effect"
             check(not (applies and changed), why, fix=fix)
+        why, fix = "--preset has no effect with --static", "leave it out"
+        check(not self.static or self.preset == Calibrate.preset, why, fix=fix)
         develops, ev = self.develop is not None, self.exposure_ev
         why = "--exposure-ev and --no-masks have no effect without --develop"
         check(develops or (ev == 0 and self.masks), why, fix="add --develop 8bit, 16bit or exr")

@@ -106,7 +106,7 @@ def survey(
 
     The folder `pixels` is for decoded photographs that do not fit into memory. If a larger scene
     contains this one, the shell lies on the `sphere` of the larger scene. UserError: memory does
-    not suffice, masks hide all pixels, or there are two backgrounds.
+    not suffice, masks hide all pixels, there are two backgrounds, or `loss.alpha` has no effect.
     """
     scene, far_notes = seeding.within_reach(scene)
     nodes, vibrating = find_nodes(scene, cfg.dynamics), vibrates(scene, cfg)
@@ -119,6 +119,9 @@ def survey(
         left = () if nodes is None else nodes.left
         fitted = store.leaving_out(left, cfg.dynamics.margin)
     _require_something_to_see(scene, fitted)
+    if cfg.loss.alpha is not None and store.backdrop is None:
+        why = "--loss.alpha has no effect: no photograph with alpha is shown over a background."
+        raise UserError(why, fix="leave it out")
     radius = seeding.cameras_radius(scene.training_views, scene.points)
     depths = seen_depths(scene.points, scene.training_views)
     depth, init = near_depth(depths), _shell_options(store, cfg)

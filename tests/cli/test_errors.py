@@ -107,6 +107,7 @@ WRONG = [
     ("sweep empty", "name a TOML file"),
     ("calibrate nowhere --out run --static", "name the folder of the photographs"),
     ("calibrate castle --out run --static --develop 8bit", "--static"),
+    ("calibrate castle --out run --static --preset paper", "--preset has no effect with --static"),
     ("calibrate castle --out run --exposure-ev 1", "without --develop"),
     ("calibrate castle --out run --no-masks", "without --develop"),
     ("calibrate castle --out run --static", "several exposures"),

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from tiny_scene import make_scene
 
-from p2gs_jax import FitConfig, Scene, load_scene, with_fields
+from p2gs_jax import FitConfig, Scene, UserError, load_scene, with_fields
 from p2gs_jax.pipeline import survey
 from p2gs_jax.run.decisions import Decisions
 
@@ -68,6 +68,12 @@ def test_gradients_are_scaled_up_to_half_the_depth_of_near_points_or_as_the_opti
     assert decided.resolve(FitConfig()).loss.near_depth == pytest.approx(depth / 2, rel=0.05)
     assert survey.decided_scale(depth, off)["near_depth"] == 0
     assert survey.decided_scale(None, FitConfig())["near_depth"] is None
+
+
+def test_a_weight_of_alpha_needs_photographs_with_alpha(scene):
+    cfg = with_fields(FitConfig(), {"loss.alpha": 0.1})
+    with pytest.raises(UserError, match=r"--loss\.alpha has no effect"):
+        survey.survey(scene, cfg)
 
 
 def test_points_that_no_view_shows_have_no_depth(scene):
