@@ -50,12 +50,13 @@ class Eval:
         from p2gs_jax.render.capacity import make_renderer
         from p2gs_jax.run.folder import RunFolder, require_free
         from p2gs_jax.run.photometry_files import write_metering
-        from p2gs_jax.run.read import load_run
+        from p2gs_jax.run.read import load_run, require_as_begun
 
         require_free(self.run)
         fitted = load_run(self.run, self.scene)
         fitted.require_photographs()
         scene, store, cfg, folder = fitted.scene, fitted.store, fitted.cfg, RunFolder(self.run)
+        require_as_begun(self.run, scene, cfg)
         name = self.lpips_weights or cfg.evaluation.lpips_weights
         weights = None if name in (None, "none") else read_lpips_weights(name)
         if weights is not None:

@@ -44,11 +44,12 @@ def _display_transform(fitted: Run, options: Render, shot: Shot | None = None) -
     else:
         ev = None if shot is None else shot.exposure_ev
         transform = fitted.common_display(0.0 if ev is None else ev)
+    ev = options.exposure_ev
     if options.meter is not None and shot is not None and shot.exposure_ev is not None:
-        metered = fitted.common_display(shot.exposure_ev)  # includes --exposure-ev
-        transform = replace(transform, exposure=metered.exposure)
-    elif isinstance(options.exposure_ev, float | int):
-        common = fitted.common_display(float(options.exposure_ev))
+        ev = shot.exposure_ev  # includes --exposure-ev
+    if isinstance(ev, float | int):
+        # The correction and the white balance of a view hold the exposure of its photograph.
+        common = fitted.common_display(float(ev))
         transform = replace(common, gamma=transform.gamma, camera=transform.camera)
     if options.white_balance_of is not None:
         balance = fitted.white_balance_of(options.white_balance_of)

@@ -169,6 +169,8 @@ def _write_model(folder: Path, scene: Scene, store: ImageStore, names: Mapping[s
     model.update_point_3d_errors()
     folder.mkdir(parents=True)
     model.write_binary(str(folder))
+    if held_out := [names[view.name] for view in scene.views if view.split == "test"]:
+        write_text(folder / "test.txt", "\n".join(held_out) + "\n")
 
 
 def _with_alpha(

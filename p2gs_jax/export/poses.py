@@ -48,14 +48,19 @@ class Poses:
         A name keeps its suffix if it is one of `suffixes`, and has the suffix `other` otherwise.
         """
         out, used = dict[str, str](), set[str]()
-        for view, stated in self.stated.items():
-            suffix = _suffix(stated) or PurePosixPath(view).suffix
+
+        def suffix_of(view: str) -> str:
+            return _suffix(self.stated[view]) or PurePosixPath(view).suffix
+
+        # Names that stay come first, so that no other photograph gets one of them.
+        for view in sorted(self.stated, key=lambda view: suffix_of(view).lower() not in suffixes):
+            stated, suffix = self.stated[view], suffix_of(view)
             stem = PurePosixPath(self.base, stated.removesuffix(_suffix(stated))).as_posix()
             place = stem + (suffix if suffix.lower() in suffixes else other)
             # Photographs whose names differ only by suffix get different places.
             out[view] = place if place not in used else f"{stem}-{suffix[1:]}{other}"
             used.add(out[view])
-        return out
+        return {view: out[view] for view in self.stated}
 
     def notes(self, places: Mapping[str, str]) -> list[str]:
         """Return a note on photographs with another suffix than in the scene's files, if any."""
@@ -160,11 +165,11 @@ def _json(
         place = names[stated]
         same = place == stated if _suffix(stated) else place.startswith(f"{stated}.")
         if not same or os.path.isabs(name) or ".." in Path(name).parts:
-            new[name] = frame["file_path"] = place
+            new[stated] = frame["file_path"] = place
         frame.pop("mask_path", None)
         frame |= {"mask_path": masks[stated]} if masks else {}
     for key in content.keys() & set(_NAMES_IN_JSON):
-        content[key] = [new.get(name, name) for name in content[key]]
+        content[key] = [new.get(_plain(path, name), name) for name in content[key]]
     for key, value in [(k, v) for part in (content, *_frames(content)) for k, v in part.items()]:
         named = key.endswith("_path") and key not in ("file_path", "mask_path")
         if named and isinstance(value, str) and (path.parent / value).is_file():

@@ -28,6 +28,8 @@ from p2gs_jax.pipeline.fit import fit
 from p2gs_jax.pipeline.preflight import Paths, check_run_dir, preflight
 from p2gs_jax.presets import from_dict, to_dict
 from p2gs_jax.run.folder import RunFolder, locked, require_folder
+from p2gs_jax.run.read import read_config, require_as_begun
+from p2gs_jax.run.scene_file import read_scene
 
 TABLE, TABLE_TEXT, JOBS = "sweep.json", "sweep.md", "jobs"
 
@@ -63,8 +65,9 @@ def sweep(
 ) -> SweepResult:
     """Fit a scene with every configuration and seed.
 
-    Finished runs in `out` are kept, interrupted ones continue, and failed ones are tried again. A
-    failure ends its run, but not the sweep. The table is written after every run.
+    Finished runs in `out` are kept, or evaluated again under other options of the evaluation.
+    Interrupted ones continue, and failed ones are tried again. A failure ends its run, but not the
+    sweep. The table is written after every run.
 
     Each of `seeds` replaces `train.seed`. `max_parallel` processes run at a time; on one
     machine they share its cores. The engine is one of `jobs.engines.open_engine`. `report` receives
@@ -72,8 +75,8 @@ def sweep(
 
     Raises:
         UserError: there is nothing to do, names or seeds share a folder, options are not valid, a
-            folder has other options, `out` is a file or another sweep writes to it, or the engine
-            does not exist.
+            folder has other options or photographs, `out` is a file or another sweep writes to it,
+            or the engine does not exist.
         Interrupted: a signal arrived; running fits write their checkpoints first.
     """
     scene, out = Path(scene), Path(out)
@@ -81,7 +84,7 @@ def sweep(
     check_engine(engine)
     require_folder(out)
     out.mkdir(parents=True, exist_ok=True)
-    jobs, rows, longer = _planned(scene, out, configs, seeds, reference)
+    jobs, rows, left = _planned(scene, out, configs, seeds, reference)
 
     def record(number: int, state: JobState | None) -> None:
         """Record the result of a run; None: the run was finished before."""
@@ -94,8 +97,6 @@ def sweep(
         write_text(out / TABLE_TEXT, to_markdown(rows))
 
     with locked(out):
-        done = [RunFolder(job.folder).metrics.exists() for job in jobs]
-        left = [k for k in range(len(jobs)) if k in longer or not done[k]]
         for number in sorted({*range(len(jobs))} - {*left}):
             record(number, None)
         if left:
@@ -117,10 +118,10 @@ def _planned(
     configs: Mapping[str, FitConfig],
     seeds: Sequence[int],
     reference: str | Path | None,
-) -> tuple[list[Job], list[dict[str, Any]], set[int]]:
+) -> tuple[list[Job], list[dict[str, Any]], list[int]]:
     """Return the jobs of all configurations and seeds, the first cells of their rows, and the
-    numbers of finished runs that now have more steps or time."""
-    jobs, rows, longer = [], [], set()
+    numbers of those that are not finished."""
+    jobs, rows, left = [], [], []
     truth = None if reference is None else str(Path(reference).absolute())
     for name, cfg in configs.items():
         for seed in seeds:
@@ -128,14 +129,27 @@ def _planned(
             folder = out / slug(name) / f"seed_{seed}"
             try:
                 preflight(seeded, Paths.of(scene, folder, reference), resume=True)
+                if not _is_finished(folder, scene, seeded):
+                    left.append(len(jobs))
             except UserError as error:
                 raise UserError(f"{name}: {error.message}", fix=error.fix) from error
-            if check_run_dir(folder, True, seeded):
-                longer.add(len(jobs))
             arguments = {"scene": str(scene.absolute()), "reference": truth, "fit": to_dict(seeded)}
             jobs.append(Job(f"{name}, seed {seed}", folder, fit_task, arguments))
             rows.append({"name": name, "seed": seed, "run": str(folder), "status": "waiting"})
-    return jobs, rows, longer
+    return jobs, rows, left
+
+
+def _is_finished(folder: Path, scene: Path, cfg: FitConfig) -> bool:
+    """Return whether a run has the steps, the time and the evaluation that its options ask for.
+
+    UserError: its photographs were replaced since it began.
+    """
+    files = RunFolder(folder)
+    begun = files.metrics.exists() and files.config.exists()
+    if check_run_dir(folder, True, cfg) or not begun:
+        return False
+    require_as_begun(folder, read_scene(folder, scene), cfg)
+    return read_config(files.config)[1].evaluation == cfg.evaluation
 
 
 def _check(configs: Mapping[str, FitConfig], seeds: Sequence[int], max_parallel: int) -> None:

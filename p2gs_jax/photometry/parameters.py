@@ -16,6 +16,7 @@ from p2gs_jax.core.streams import Stream, generator
 from p2gs_jax.photometry.appearance import Corrections, identity
 from p2gs_jax.photometry.formation import camera_rows, inverse_tone_map
 from p2gs_jax.photometry.luminance import Luminance, statistics_of
+from p2gs_jax.photometry.models import MODELS
 from p2gs_jax.photometry.solution import PhotometricSolution
 from p2gs_jax.render.harmonics import RadianceKind, scaled
 from p2gs_jax.types import GAMMA_SRGB, Params, Photometry, Scene, View
@@ -26,7 +27,7 @@ LEAST_EXPOSURE = 0.1  # lower bound of random exposures
 def initial_photometry(
     solution: PhotometricSolution | None, cameras: Sequence[str], cfg: FitConfig
 ) -> Photometry:
-    """Return the start: a solution, or gamma 2.2 with random exposures (paper).
+    """Return the start: a solution, or gamma 2.2 with random exposures (paper) if these vary.
 
     `cameras` has the camera of every training view.
     """
@@ -35,7 +36,8 @@ def initial_photometry(
     if solution is not None:
         log_exposures = np.asarray(solution.log_exposures)
     else:
-        draws = generator(cfg.train.seed, Stream.START_EXPOSURES).normal(1.0, p.start_std, count)
+        std = p.start_std if MODELS[p.model].exposure else 0.0
+        draws = generator(cfg.train.seed, Stream.START_EXPOSURES).normal(1.0, std, count)
         log_exposures = np.log(np.maximum(draws, LEAST_EXPOSURE))
     gammas = np.full(count, GAMMA_SRGB) if solution is None else solution.gammas
     if p.parameterization == "log":

@@ -24,14 +24,14 @@ from p2gs_jax.evaluation.lpips import LpipsWeights, read_lpips_weights
 from p2gs_jax.evaluation.references import Reference, check_reference, load_reference
 from p2gs_jax.gaussians.population import Coverage, seed_bound
 from p2gs_jax.options import check_values
+from p2gs_jax.photometry.models import MODELS
 from p2gs_jax.photometry.response import KNOTS
 from p2gs_jax.presets import flat, to_dict
 from p2gs_jax.run.checkpoint import CheckpointStore
 from p2gs_jax.run.decisions import CHOSEN
 from p2gs_jax.run.folder import RunFolder, find, require_folder, require_free
-from p2gs_jax.run.read import read_config
+from p2gs_jax.run.read import read_config, require_as_begun
 from p2gs_jax.scene.exposures import check_source, read_known_exposures
-from p2gs_jax.scene.files import recognition_key
 from p2gs_jax.scene.masks import background_color
 from p2gs_jax.scene.pixels.store import size_at
 from p2gs_jax.scene.split import EVERY, check_every, read_split
@@ -89,17 +89,12 @@ def check_scene(
     The result is the photographs under one common exposure, if there are any. UserError: the
     options do not suit the views, or the run began with other photographs or cameras.
     """
-    training, begun = scene.training_views, RunFolder(paths.run).config
-    now = recognition_key(scene.views, cfg.photometry.known)
-    if begun.exists() and read_config(begun)[0].get("photographs") != now:
-        why = f"{paths.run} was begun with other photographs, cameras, held-out views or known "
-        why += f"exposures than {paths.scene} and the options name now."
-        fix = "restore them as they were, or name another folder with --out"
-        raise UserError(why, fix=fix)
+    if RunFolder(paths.run).config.exists():
+        require_as_begun(paths.run, scene, cfg)
     if lpips_weights is not None:
         lpips_weights.require_sizes(scene.views, cfg.data.max_width)
     if cfg.photometry.known is not None:
-        read_known_exposures(cfg.photometry.known, training, scene.views)
+        read_known_exposures(cfg.photometry.known, scene.training_views, scene.views)
     return None if paths.reference is None else load_reference(paths.reference, scene, cfg)
 
 
@@ -140,6 +135,21 @@ def check_options(cfg: FitConfig) -> None:
         why = f"{' and '.join(options)} would have no effect: --photometry.start is random."
         plain = " ".join(f"{o} {value}" for o, value in zip(options, given.values(), strict=True))
         raise UserError(why, fix=f"add --photometry.start tracks, or {plain}")
+    regularizers, relative = cfg.loss.regularizers, cfg.loss.relative_exposure
+    of_exposures = {
+        name: getattr(regularizers, name)
+        for name in ("exposure_scale", "exposure_variance", "gamma_prior")
+    }
+    pulls = [f"regularizers.{name}" for name, value in of_exposures.items() if value is not None]
+    # The other form of this loss also reaches the Gaussians.
+    if relative.weight is not None and relative.form == "observed_ldr":
+        pulls.append("relative-exposure.weight")
+    if pulls and p.start == "tracks":
+        why = f"--loss.{pulls[0].replace('_', '-')} has no effect: exposures are solved beforehand."
+        raise UserError(why, fix="leave it out, or add --photometry.start random")
+    if "camera" in MODELS[p.model][:2] and p.start != "tracks":
+        why = f"the model {p.model} needs solved exposures: a fit learns those of views only."
+        raise UserError(why, fix="add --photometry.start tracks, or another --photometry.model")
     if not curved and p.start == "tracks":
         why = "the curve 'linear' splats display values; it does not combine with solved exposures."
         fix = "add --photometry.start random, or use the preset ppisp or one of 3dgs*"

@@ -26,13 +26,16 @@ from p2gs_jax.photometry.formation import LEAST_ALPHA
 from p2gs_jax.photometry.metering import Metering
 from p2gs_jax.render.capacity import RenderView, make_renderer
 from p2gs_jax.run import photometry_files, read
+from p2gs_jax.run.scene_file import folder_of
 from p2gs_jax.scene import find_scene, with_masks_and_split
+from p2gs_jax.scene.exposures import row_finder
 from p2gs_jax.scene.masks import with_alpha
 from p2gs_jax.scene.pixels.store import camera_of
 from p2gs_jax.types import GAMMA_SRGB, Gaussians, Params, Scene
 
 # The table of `calibrate --develop` beside the photographs that it wrote: `ev` is their exposure.
 DEVELOPED = Path("developed") / "exposures.csv"
+AGAIN = "repeat `p2gs-jax calibrate ... --develop`"
 # Lifted Gaussians are compared in at most `MEASURED` views, at most `MEASURED_WIDTH` pixels wide.
 # `NEAR` is the depth of other programs' near plane, scene units.
 MEASURED, MEASURED_WIDTH, NEAR = 60, 960, 0.01
@@ -124,7 +127,10 @@ def foreign_run(splats: str | Path, photometry: str | Path, scene: str | Path) -
     if not isinstance(found, Scene):
         fix = f"name the scene that the other program read, {DEVELOPED.parent} in {folder}"
         raise broken(scene, "has no COLMAP model and no transforms.json", fix)
-    found, notes = _with_known(with_alpha(with_masks_and_split(found, data), data), saved, path)
+    found = with_alpha(with_masks_and_split(found, data), data)
+    if folder_of(found.root).resolve() == (folder / DEVELOPED).parent.resolve():
+        saved = _with_developed_names(saved, folder, found)
+    found, notes = _with_known(found, saved, path)
     gaussians = read_splats(splats)
     means = on_device(np.asarray(gaussians.means, np.float64) - np.array(found.origin))
     gaussians, developed = replace(gaussians, means=means), common_look(folder, saved)
@@ -141,6 +147,24 @@ def foreign_run(splats: str | Path, photometry: str | Path, scene: str | Path) -
         splats=gaussians,
         developed=developed,
     )
+
+
+def _with_developed_names(
+    saved: photometry_files.PhotometryFile, folder: Path, scene: Scene
+) -> photometry_files.PhotometryFile:
+    """Return the photometry of a calibration by the names of its developed photographs."""
+    row_of = row_finder(scene.views, folder / DEVELOPED)
+    rows = [row_of(row["image"]) for row in _developed(folder)]
+    named = zip(saved["views"], rows, strict=True)
+    views = [v | {"image": scene.views[row].name} for v, row in named if row is not None]
+    return {**saved, "views": views}  # pyright: ignore[reportReturnType]
+
+
+def _developed(folder: Path) -> list[dict[str, str]]:
+    """Return the rows of the table of developed photographs, in the order of `photometry.json`."""
+    with readable(folder / DEVELOPED, AGAIN):
+        lines = (folder / DEVELOPED).read_text(encoding="utf-8").splitlines()
+        return [row for _, row in read_csv(folder / DEVELOPED, lines)[1]]
 
 
 def _with_known(
@@ -169,10 +193,8 @@ def common_look(folder: Path, saved: photometry_files.PhotometryFile) -> Display
     cfg = photometry_files.with_formation_of(PhotometryConfig(), saved)
     common = DisplayTransform(mean["exposure_geometric"], mean["gamma"], cfg)
     if path.is_file():
-        fix = "repeat `p2gs-jax calibrate ... --develop`"
-        with readable(path, fix):
-            lines = path.read_text(encoding="utf-8").splitlines()
-            rows = [row for _, row in read_csv(path, lines)[1]]
+        rows = _developed(folder)
+        with readable(path, AGAIN):
             row, exposures = rows[0], [view["exposure"] for view in saved["views"]]
             known = [(r["original_ev"], e) for r, e in zip(rows, exposures, strict=True) if e]
             common = replace(common, exposure=2.0 ** float(row["ev"]))
@@ -180,5 +202,5 @@ def common_look(folder: Path, saved: photometry_files.PhotometryFile) -> Display
             if row["image"].lower().endswith(".exr"):
                 common = replace(common.with_curve("linear"), gamma=GAMMA_SRGB)
         if not same:
-            raise broken(path, "and photometry.json are of different calibrations", fix)
+            raise broken(path, "and photometry.json are of different calibrations", AGAIN)
     return common

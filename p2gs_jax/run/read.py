@@ -31,6 +31,7 @@ from p2gs_jax.run.decisions import read_decisions
 from p2gs_jax.run.folder import RunFolder, find
 from p2gs_jax.run.scene_file import read_objects, read_scene
 from p2gs_jax.scene.drives.objects import MovingObjects
+from p2gs_jax.scene.files import recognition_key
 from p2gs_jax.scene.pixels.store import ImageStore, camera_of
 from p2gs_jax.types import GAMMA_SRGB, Camera, Gaussians, Params, Photometry, Render, Scene
 
@@ -325,6 +326,15 @@ def photometry_of(
         balances = on_device(np.log(np.array(factors, float)))
     rows = camera_rows([view.camera for view in scene.training_views], p)
     return Photometry(on_device(exposures), on_device(gammas), p.parameterization, balances, rows)
+
+
+def require_as_begun(folder: Path, scene: Scene, cfg: FitConfig) -> None:
+    """Raise UserError: a run began with other photographs, cameras or known exposures than now."""
+    begun = read_config(RunFolder(folder).config)[0].get("photographs")
+    if begun != recognition_key(scene.views, cfg.photometry.known):
+        why = f"{folder} was begun with other photographs, cameras, held-out views or known "
+        why += f"exposures than {scene.root} and the options name now."
+        raise UserError(why, fix="restore them as they were, or fit again in another folder")
 
 
 def read_config(path: Path) -> tuple[dict[str, Any], FitConfig]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import re
 from collections import defaultdict
 from collections.abc import Callable, Sequence
 from pathlib import Path, PurePosixPath
@@ -133,7 +134,9 @@ def _read(path: Path) -> dict[str, float]:
         why = f"cannot be read: {getattr(error, 'strerror', None) or error}."
         fix = "name a CSV file with the columns image and ev, or exif"
         raise broken(path, why, fix) from error
-    lines = ["" if line.startswith("#") else line.strip() for line in text.splitlines()]
+    # The name of a photograph may begin with #; a comment has no comma, or a space after the #.
+    comment = re.compile(r"#( |[^,]*$)")
+    lines = ["" if comment.match(line) else line.strip() for line in text.splitlines()]
     try:
         names, rows = read_csv(path, lines)
     except csv.Error as error:

@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
+from p2gs_jax.core.atomic import write_json
 from p2gs_jax.formats.exr import write_exr
 from p2gs_jax.run.read import load_run
 
@@ -39,6 +40,15 @@ def judged(succeeded, run_copy):
         return [*found.values()], text
 
     return judge
+
+
+def test_replaced_photographs_are_not_judged(run_copy, refused):
+    before = (run_copy / "metrics.json").read_text()
+    config = json.loads((run_copy / "config.json").read_text())
+    write_json(run_copy / "config.json", config | {"photographs": "of another time"})
+    assert "was begun with other photographs" in refused("eval", run_copy)
+    assert (run_copy / "metrics.json").read_text() == before
+    write_json(run_copy / "config.json", config)
 
 
 def test_renders_of_the_run_itself_have_its_scores(run_copy, judged, tmp_path):

@@ -1,6 +1,7 @@
 """`render` on a small run: pictures, cameras, videos, and files that are kept."""
 
 import json
+from dataclasses import replace
 from types import SimpleNamespace
 
 import av
@@ -8,8 +9,10 @@ import cv2
 import numpy as np
 import pytest
 
+from p2gs_jax.cli.frames import _display_transform
 from p2gs_jax.cli.render import Render, _default_name
 from p2gs_jax.formats.exr import read_exr
+from p2gs_jax.paths.shots import view_shots
 from p2gs_jax.run.read import load_run
 
 
@@ -98,6 +101,25 @@ def test_a_drive_can_be_metered(rendered, finished_run, tmp_path):
     exposed = load_run(finished_run).common_display(metered[2]).exposure * light
     assert np.exp(np.log(exposed[exposed > 0]).mean()) == pytest.approx(0.18, rel=0.3)
     assert "Metering:" in rendered(*bare, "--meter", "auto", "--out", tmp_path / "auto")
+
+
+def test_a_metered_view_has_nothing_of_its_photograph_but_gamma_and_camera(finished_run):
+    fitted = load_run(finished_run)
+    (shot,) = view_shots(fitted.scene.views[1:2])
+    own = replace(fitted.own_display(1), white_balance=(0.3, 0.0, -0.3), gamma=1.9)
+    run = SimpleNamespace(own_display=lambda row: own, common_display=fitted.common_display)
+    options = Render(run=finished_run, meter="log_average")
+    metered = _display_transform(run, options, replace(shot, exposure_ev=0.5))
+    common = fitted.common_display(0.5)
+    assert metered == replace(common, gamma=1.9, camera=own.camera)
+
+
+def test_the_file_of_a_trajectory_is_never_replaced(rendered, refused, finished_run, tmp_path):
+    rendered("--width", 64, "--out", tmp_path)
+    before = (tmp_path / "cameras.json").read_bytes()
+    argv = ("--trajectory", tmp_path / "cameras.json", "--out", tmp_path, "--overwrite")
+    assert "which would be replaced" in refused("render", finished_run, *argv)
+    assert (tmp_path / "cameras.json").read_bytes() == before
 
 
 def test_frames_are_replaced_only_with_overwrite(refused, rendered, finished_run, tmp_path):

@@ -19,7 +19,7 @@ from p2gs_jax.config import CameraFormation, DataConfig
 from p2gs_jax.core.numerics import on_host
 from p2gs_jax.core.progress import Silent
 from p2gs_jax.export.develop import Development, develop_scene
-from p2gs_jax.export.poses import poses_of
+from p2gs_jax.export.poses import Poses, poses_of
 from p2gs_jax.formats.exr import read_exr
 from p2gs_jax.photometry.calibrate import Selection
 from p2gs_jax.photometry.formation import formation
@@ -308,6 +308,8 @@ def test_other_pose_files_name_the_developed_photographs(tmp_path, kind):
     name = "./images/{}.png" if kind == "transforms" else "images/{}"
     pose = {"transform_matrix": np.eye(4).tolist()}
     content = {"fl_x": 90.0, "w": 112, "h": 100}
+    if kind == "transforms":
+        content["test_filenames"] = ["images/0.png"]
     content["frames"] = frames = [{"file_path": name.format(k), **pose} for k in range(6)]
     place = root / {"blender": "transforms_train.json"}.get(kind, "transforms.json")
     if kind == "llff":
@@ -331,7 +333,15 @@ def test_other_pose_files_name_the_developed_photographs(tmp_path, kind):
     run(root, selection, depth="exr")
     after = json.loads((out / place.name).read_text())
     assert after["frames"][0]["file_path"] == "images/0.exr"
+    assert after.get("test_filenames", ["images/0.exr"]) == ["images/0.exr"]
     assert all((out / f["mask_path"]).is_file() for f in after["frames"])
+
+
+def test_photographs_that_differ_only_by_suffix_get_different_places():
+    both = Poses({}, {"a.jpg": "a.jpg", "a.png": "a.png"})
+    # The one that keeps its name has no other photograph's place.
+    places = {"a.jpg": "images/a-jpg.png", "a.png": "images/a.png"}
+    assert both.places((".png",), ".png") == places
 
 
 def test_originals_are_never_replaced(tmp_path):

@@ -1,6 +1,7 @@
 """Exports for other programs hold the same scene: poses, photographs, points and exposures."""
 
 import json
+from dataclasses import replace
 
 import jax.numpy as jnp
 import numpy as np
@@ -41,6 +42,11 @@ def rows(scene):
 
 def export(root, cfg, program="colmap"):
     scene = load_scene(root, cfg, root / "cache")
+    # Other views than the reader would hold out by itself.
+    views = [
+        replace(v, split="test" if i in (2, 3) else "train") for i, v in enumerate(scene.views)
+    ]
+    scene = replace(scene, views=tuple(views))
     store = ImageStore(scene.views, cfg)
     write_folder(program, root / "out", scene, store, rows(scene))
     return scene, store, load_scene(root / "out", DataConfig())

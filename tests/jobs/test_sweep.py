@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 import threading
 from pathlib import Path
@@ -20,6 +21,7 @@ from p2gs_jax.jobs.sweep import SweepResult, brief, failures, read_row, sweep, t
 from p2gs_jax.run.decisions import Decisions
 from p2gs_jax.run.folder import RunFolder, locked
 from p2gs_jax.run.photometry_files import read_photometry
+from p2gs_jax.run.read import read_config
 from p2gs_jax.run.write import write_start
 
 BASE = p2gs_jax.preset("robust")
@@ -249,7 +251,7 @@ def runner(work):
 
 
 def finished(run, stop):
-    run.mkdir(parents=True)
+    run.mkdir(parents=True, exist_ok=True)
     (run / "metrics.json").write_text('{"counts": {"gaussians": 5}, "seconds": {}}')
     (run / "photometry.json").write_text('{"views": []}')
     return "done", None
@@ -302,6 +304,27 @@ def test_a_run_with_broken_files_fails_alone(tmp_path):
     rows = sweep("scene", tmp_path, CONFIGS, max_parallel=3, run=runner(work)).rows
     assert [row["status"] for row in rows] == ["done", "failed", "done"]
     assert "its files cannot be read" in rows[1]["reason"]
+
+
+def test_finished_runs_are_kept_under_the_same_evaluation_and_photographs(finished_run, tmp_path):
+    scene, out = tmp_path / "scene", tmp_path / "out"
+    folder = shutil.copytree(finished_run, out / "a" / "seed_0")
+    shutil.copytree(finished_run.parent / "scene", scene)
+    saved = json.loads((folder / "config.json").read_text()) | {"scene": str(scene)}
+    (folder / "config.json").write_text(json.dumps(saved))
+    cfg = read_config(folder / "config.json")[1]
+    again = runner(lambda run, stop: ("failed", "evaluated again"))
+    (row,) = sweep(scene, out, {"a": cfg}, run=again).rows
+    assert row["status"] == "done"
+    first, second = sorted((scene / "images").iterdir())[:2]
+    shutil.copy(second, first)
+    with pytest.raises(UserError, match=r"a: .* was begun with other photographs"):
+        sweep(scene, out, {"a": cfg}, run=again)
+    shutil.copy(finished_run.parent / "scene" / "images" / first.name, first)
+    saved["fit"]["evaluation"]["lpips_weights"] = "alex"
+    (folder / "config.json").write_text(json.dumps(saved))
+    (row,) = sweep(scene, out, {"a": cfg}, run=again).rows
+    assert (row["status"], row["reason"]) == ("failed", "evaluated again")
 
 
 def test_two_sweeps_do_not_share_a_folder(tmp_path):

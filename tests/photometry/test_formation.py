@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from p2gs_jax import with_fields
 from p2gs_jax.config import CameraFormation, PhotometryConfig, RegularizerConfig
 from p2gs_jax.photometry.display import DisplayTransform, develop, undevelop
 from p2gs_jax.photometry.formation import (
@@ -20,7 +21,7 @@ from p2gs_jax.photometry.formation import (
     squared_radii,
     tone_map,
 )
-from p2gs_jax.photometry.parameters import recentre
+from p2gs_jax.photometry.parameters import initial_photometry, recentre
 from p2gs_jax.photometry.response import KNOTS, Response, log_exposed
 from p2gs_jax.presets import preset
 from p2gs_jax.render.harmonics import radiance_activation, radiance_preactivation
@@ -315,3 +316,10 @@ def test_exposures_below_the_normal_numbers_have_a_gauge():
     value, gradient = jax.value_and_grad(term)(raw)
     assert float(value) == pytest.approx(weight * 29**2)
     np.testing.assert_allclose(gradient, weight * 2 * -29 / 3, rtol=1e-6)
+
+
+@pytest.mark.parametrize(("model", "varies"), [("constant", False), ("view_exposure", True)])
+def test_random_exposures_are_drawn_only_where_they_are_learned(model, varies):
+    cfg = with_fields(preset("paper"), {"photometry.model": model})
+    start = initial_photometry(None, ["front", "front", "left"], cfg)
+    assert bool(np.ptp(np.asarray(start.exposures)) > 0) == varies

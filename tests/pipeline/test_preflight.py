@@ -44,6 +44,20 @@ def scene(tmp_path_factory):
         (("--preset", "ppisp", "--photometry.curve", "srgb"), "a whole camera"),
         (("--preset", "paper", "--photometry.curve", "spline"), "'spline' has no values"),
         (("--known-exposures", "KNOWN"), "names none of the"),
+        (("--loss.regularizers.gamma-prior", "0.1"), "gamma-prior has no effect: exposures are"),
+        (
+            (
+                "--loss.relative-exposure.weight",
+                "1",
+                "--loss.relative-exposure.form",
+                "observed_ldr",
+            ),
+            "--loss.relative-exposure.weight has no effect",
+        ),
+        (
+            ("--preset", "paper", "--photometry.model", "camera_exposure"),
+            "the model camera_exposure needs solved exposures",
+        ),
         (("--known-exposures", "exif"), "carries an exposure time"),
     ],
 )
@@ -70,6 +84,15 @@ def test_a_refused_option_does_not_lock_the_folder(tmp_path, scene, refused, opt
         ("train.budget_s", -1.0, "--budget must be longer than 0 s"),
         ("densify.max_gaussians", 0, "--gaussians must be at least 1"),
         ("photometry.known_deviation_ev", 0.1, "add --known-exposures FILE"),
+        ("train.sh_every", 0.0, "--train.sh-every must be at least 1e-09"),
+        (
+            "train.coarse_to_fine",
+            (0.5, 0.25),
+            "--train.coarse-to-fine (0.5, 0.25) does not increase",
+        ),
+        ("dynamics.most_points", 0, "--dynamics.most-points must be at least 1"),
+        ("init.opacity", 1.0, "--init.opacity must be at most 0.999999"),
+        ("render.blur", -1.0, "--render.blur must be at least 0"),
         ("photometry.spline", (1.0, 2.0), "--photometry.spline has 2 values, and not 20"),
     ],
 )

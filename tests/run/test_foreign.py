@@ -83,6 +83,19 @@ def test_gaussians_are_lifted_to_radiance_and_the_error_is_reported(succeeded, t
     assert json.loads((tmp_path / "linear.json").read_text())["lifting_error"]["max_codes"] < 1.5
 
 
+def test_names_of_developed_photographs_mean_their_originals(trained, tmp_path):
+    # `a.jpg` was developed as `a-jpg.png`, beside the photograph `a.png`.
+    write_calibration(tmp_path / "cal", ("1.jpg", "1.png", "0.png"), "1")
+    developed = shutil.copytree(trained / "scene", tmp_path / "cal" / "developed")
+    names, evs = ("0.png", "1.png", "2.png"), (*np.log2(EXPOSURES), "")
+    rows = [f"{n},1,{DEVELOPED_EV},{ev}\n" for n, ev in zip(names, evs, strict=True)]
+    table = "image,camera,ev,original_ev\n" + "".join(rows)
+    (developed / "exposures.csv").write_text(table)
+    run = foreign_run(trained / "splat.ply", tmp_path / "cal", developed)
+    assert [run.own_display(row).exposure for row in (0, 1)] == pytest.approx(EXPOSURES)
+    assert run.scene.test_indices == (2,)
+
+
 def test_without_developed_photographs_colours_show_the_mean_exposure(trained, tmp_path):
     write_calibration(tmp_path / "cal", ("0.png", "1.png", "2.png"), "1")
     run = foreign_run(trained / "splat.ply", tmp_path / "cal", trained / "scene")
