@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from p2gs_jax.core.clock import whole_run
-from p2gs_jax.core.text import escaped, markdown_table
+from p2gs_jax.core.text import escaped, markdown_table, value_at
 from p2gs_jax.errors import UserError
 from p2gs_jax.evaluation.alignment import true_error
 from p2gs_jax.evaluation.renders_of_others import read_display
@@ -117,9 +117,10 @@ def _labels(folders: list[Path]) -> list[str]:
 
 
 def _same_scene(first: RunFiles, other: RunFiles) -> bool:
-    """Return whether two runs share the scene folder or have the same held-out photograph."""
+    """Return whether two runs share folder and drive, or have the same held-out photograph."""
     if first.scene.resolve() == other.scene.resolve():
-        return True
+        drives = [value_at(run.options, ("data", "drive")) for run in (first, other)]
+        return drives[0] == drives[1]
     others = {h.name: h.photograph for h in other.held_out}
     for view in first.held_out:
         if view.name in others:

@@ -75,6 +75,9 @@ def test_runs_of_different_scenes_get_a_table_and_a_sentence(runs, tmp_path):
     assert compare_runs([runs[0], stranger]).same_scene
     for file in (stranger / "renders").glob("*.photograph.png"):
         file.write_bytes((runs[0] / "renders" / file.name).read_bytes()[:100])
+    other_drive = copy_run(runs[1], tmp_path / "other_drive")
+    edit(other_drive / "config.json", lambda c: c["fit"]["data"].update(drive="002"))
+    assert not compare_runs([runs[0], other_drive]).same_scene
     found = compare_runs([runs[0], stranger])
     assert not found.same_scene
     assert "different scenes" in found.remarks[0]
