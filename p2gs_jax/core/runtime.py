@@ -8,11 +8,8 @@ disk.
 from __future__ import annotations
 
 import ctypes
-import hashlib
 import os
-import platform
 import sys
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -104,7 +101,7 @@ def use_compile_cache() -> None:
     """
     if jax.config.values["jax_compilation_cache_dir"] is not None:
         return
-    folder = platformdirs.user_cache_path("p2gs-jax", appauthor=False) / _cache_name()
+    folder = platformdirs.user_cache_path("p2gs-jax", appauthor=False) / "jax"
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError:
@@ -112,14 +109,3 @@ def use_compile_cache() -> None:
     jax.config.update("jax_compilation_cache_dir", str(folder))
     jax.config.update("jax_compilation_cache_max_size", MOST_BYTES)
     jax.config.update("jax_persistent_cache_min_compile_time_secs", SHORTEST_S)
-
-
-def _cache_name() -> str:
-    """Return a folder name for the JAX version and CPU features, on which programs depend."""
-    features = platform.processor()
-    info = Path("/proc/cpuinfo")
-    if info.is_file():
-        lines = info.read_text(errors="replace").splitlines()
-        features = next((line for line in lines if line.startswith(("flags", "Features"))), "")
-    key = hashlib.sha256(features.encode()).hexdigest()[:12]
-    return f"jax-{jax.__version__}-{platform.machine()}-{key}"

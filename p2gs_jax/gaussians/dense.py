@@ -122,11 +122,8 @@ def dense_seeds(
     wanted = [int(r) for r in evenly_spaced(len(rows), most_views) if len(near[r]) >= 2]
     flows = Flows(images, scene.points, seen)
     found: list[Candidates] = []
-
-    def candidates_of(row: int) -> Candidates:
-        return _candidates(row, near[row], flows, color, cfg.train.seed)
-
-    for done, candidates in enumerate(map_in_order(candidates_of, wanted)):
+    of_rows = map_in_order(lambda r: _candidates(r, near[r], flows, color, cfg.train.seed), wanted)
+    for done, candidates in enumerate(of_rows):
         found.append(candidates)
         on_view(done + 1, len(wanted))
     if not sum(len(c.xy) for c in found):

@@ -67,23 +67,18 @@ def rough_tones(tracks: Observations | None, count: int) -> Tones:
     the log factor is the mean residual of log radiance from the mean of each point. Without tracks,
     all factors are 1.
     """
-    log_exposures = np.zeros(count)
-    if tracks is None or not len(tracks.points):
-        return _srgb_tones(log_exposures)
-    good = ((tracks.colors > 0.03) & (tracks.colors < 0.95)).all(1)  # neither black nor clipped
-    z = base_log(tracks.colors[good], "srgb")[0].mean(1)
-    views, points = tracks.views[good], tracks.points[good]
-    per_view = np.maximum(np.bincount(views, minlength=count), 1)
-    per_point = np.maximum(np.bincount(points, minlength=tracks.point_count), 1)
-    for _ in range(ROUNDS):
-        mean = np.bincount(points, z - log_exposures[views], tracks.point_count) / per_point
-        off = np.clip(z - log_exposures[views] - mean[points], -1.0, 1.0)  # bounds outliers
-        log_exposures = log_exposures + np.bincount(views, off, count) / per_view
-        log_exposures -= log_exposures.mean()
-    return _srgb_tones(log_exposures)
-
-
-def _srgb_tones(log_exposures: Any) -> Tones:
+    log_exposures: Any = np.zeros(count)
+    if tracks is not None and len(tracks.points):
+        good = ((tracks.colors > 0.03) & (tracks.colors < 0.95)).all(1)  # neither black nor clipped
+        z = base_log(tracks.colors[good], "srgb")[0].mean(1)
+        views, points = tracks.views[good], tracks.points[good]
+        per_view = np.maximum(np.bincount(views, minlength=count), 1)
+        per_point = np.maximum(np.bincount(points, minlength=tracks.point_count), 1)
+        for _ in range(ROUNDS):
+            mean = np.bincount(points, z - log_exposures[views], tracks.point_count) / per_point
+            off = np.clip(z - log_exposures[views] - mean[points], -1.0, 1.0)  # bounds outliers
+            log_exposures = log_exposures + np.bincount(views, off, count) / per_view
+            log_exposures -= log_exposures.mean()
     return Tones(Photometry(log_exposures, 0 * log_exposures), PhotometryConfig())
 
 

@@ -23,6 +23,7 @@ from p2gs_jax.photometry.calibrate import Selection
 from p2gs_jax.photometry.models import Form
 from p2gs_jax.render.capacity import make_renderer
 from p2gs_jax.run.folder import RunFolder
+from p2gs_jax.run.plots import write_summary
 from p2gs_jax.run.write import summary_rows, write_run, write_view
 from p2gs_jax.scene.pixels.store import ImageStore, size_at
 from p2gs_jax.types import Params, Scene
@@ -102,12 +103,11 @@ def finish(
             fitted={r: e for r, e in exposures.items() if scene.views[r].name not in hidden},
             unknown=found.metrics.get("exposures_unknown", ()),
             solution=solution,
-            shown=[result for result in in_summary.values() if result is not None],
             metering=found.metering,
-            true_exposures=true_exposures,
-            heading=heading(found.metrics, params, cfg),
-            psnrs=_psnrs(found.metrics),
         )
+        words = {"heading": heading(found.metrics, params, cfg), "psnrs": _psnrs(found.metrics)}
+        if shown := [result for result in in_summary.values() if result is not None]:
+            write_summary(folder.summary, shown, params, scene, cfg, true_exposures, **words)
     seconds = {
         **account.seconds,
         **watch.seconds,

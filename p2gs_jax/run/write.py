@@ -25,7 +25,6 @@ from p2gs_jax.render.project import at_time
 from p2gs_jax.run.decisions import Decisions
 from p2gs_jax.run.folder import RunFolder, remembered
 from p2gs_jax.run.photometry_files import write_appearance, write_fitted, write_metering
-from p2gs_jax.run.plots import write_summary
 from p2gs_jax.run.scene_file import write_objects, write_scene
 from p2gs_jax.scene.drives.objects import MovingObjects
 from p2gs_jax.scene.files import recognition_key
@@ -89,19 +88,14 @@ def write_run(
     fitted: Mapping[int, float] | None = None,
     unknown: Sequence[str] = (),
     solution: PhotometricSolution | None = None,
-    shown: Sequence[ViewResult] = (),
-    true_exposures: Mapping[str, float] | None = None,
-    heading: Sequence[str] = (),
-    psnrs: Mapping[str, float] | None = None,
 ) -> None:
-    """Write the scene, the Gaussians, the photometry and the summary for `load_run`.
+    """Write the scene, the Gaussians and the photometry for `load_run`.
 
     All slots of `params` are written. `owner` has the row of the object of each in `moving`; `cfg`
     has the options of the fit. With `decisions`, `write_start` begins the folder anew. `fitted`
     has the exposures fitted to held-out views by row, `unknown` the names of photographs with
-    unknown exposures. True exposures and PSNRs by image name, and the lines of `heading`, are for
-    the summary; without `shown` there is none. Without `metering` only the files of parameters are
-    written, as in a snapshot.
+    unknown exposures. Without `metering` only the files of parameters are written, as in a
+    snapshot.
     """
     if not isinstance(folder, RunFolder):
         folder = RunFolder(Path(folder))
@@ -131,9 +125,6 @@ def write_run(
     baked = bake(at_time(placed, None), transform, cfg.render.radiance)
     write_ply(folder.splats, baked, display_comments(transform))
     write_metering(folder.metering, metering)
-    if shown:
-        words = {"heading": heading, "psnrs": psnrs}
-        write_summary(folder.summary, shown, params, scene, cfg, true_exposures, **words)
 
 
 def write_view(folder: Path, stem: str, result: ViewResult, store: ImageStore) -> None:

@@ -73,7 +73,8 @@ def images_and_maps(folder: Path, *, recursive: bool) -> tuple[list[Path], list[
     outside = [p for p in pictures if not _is_in(p, MASK_FOLDERS + MAP_FOLDERS)]
     named = {p for p in outside if named_as_mask(p.name)}
     photos = {name_without_mask(p.as_posix()) for p in outside if p not in named}
-    masks = {p for p in named if name_without_mask(p.as_posix()) in photos or _always_mask(p.name)}
+    always = {p for p in named if p.name.lower().startswith("dynamic_mask")}
+    masks = always | {p for p in named if name_without_mask(p.as_posix()) in photos}
     images = [folder / p for p in sorted({*outside} - masks, key=lambda p: p.as_posix())]
     return images, maps
 
@@ -109,10 +110,6 @@ def files_below(folder: Path, above: tuple[Path, ...] = ()) -> Iterator[Path]:
 def named_as_mask(name: str) -> bool:
     """Return whether a file, judged by its name, may be a mask; `a.jpg.png` may be one."""
     return _MASK_NAME.search(_bare(name)) is not None or _TWO_SUFFIXES.search(name) is not None
-
-
-def _always_mask(name: str) -> bool:
-    return name.lower().startswith("dynamic_mask")
 
 
 def name_without_mask(name: str) -> str:

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 
 from p2gs_jax.scene.rigid import pose_of
 
@@ -44,14 +45,7 @@ def carla_rotation(roll: float, pitch: float, yaw: float) -> Float[np.ndarray, "
 
     Its columns are the forward, right and up axes, left-handed.
     """
-    (cr, cp, cy), (sr, sp, sy) = np.cos(a := np.deg2rad([roll, pitch, yaw])), np.sin(a)
-    return np.array(
-        [
-            [cp * cy, cy * sp * sr - sy * cr, -cy * sp * cr - sy * sr],
-            [cp * sy, sy * sp * sr + cy * cr, -sy * sp * cr + cy * sr],
-            [sp, -cp * sr, cp * cr],
-        ]
-    )
+    return Rotation.from_euler("ZYX", [yaw, -pitch, -roll], degrees=True).as_matrix()
 
 
 def camera_viewmat(

@@ -49,11 +49,7 @@ class Seam:
 
 
 def measure_seams(
-    scene: Scene,
-    store: ImageStore,
-    cut: Cut,
-    fitted: Sequence[Gaussians],
-    cfg: RenderConfig,
+    scene: Scene, store: ImageStore, cut: Cut, fitted: Sequence[Gaussians], cfg: RenderConfig
 ) -> list[Seam]:
     """Compare neighbouring blocks, with all Gaussians of each, in their common training views.
 

@@ -311,9 +311,7 @@ def _at_one_scale(
 
 
 def _coarsest(
-    points: list[Int[np.ndarray, " _"]],
-    scales: list[np.ndarray],
-    finest: Float[np.ndarray, " p"],
+    points: list[Int[np.ndarray, " _"]], scales: list[np.ndarray], finest: Float[np.ndarray, " p"]
 ) -> Float[np.ndarray, " p"]:
     """Return how much coarser than its finest view a view of each point may be.
 

@@ -7,14 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from p2gs_jax.config import DataConfig, SceneFormat
-from p2gs_jax.scene.drives import (
-    argoverse,
-    drivestudio,
-    kitti,
-    nuscenes,
-    pandaset,
-    waymo,
-)
+from p2gs_jax.scene.drives import argoverse, drivestudio, kitti, nuscenes, pandaset, waymo
 from p2gs_jax.scene.drives.recording import Recording
 from p2gs_jax.scene.files import Report
 

@@ -29,6 +29,7 @@ from p2gs_jax.scene.drives.recording import Photograph, Recording, RigCamera, Sw
 from p2gs_jax.scene.drives.tables import (
     Kinds,
     Row,
+    box_size,
     chosen_drive,
     counted,
     finite_numbers,
@@ -252,10 +253,7 @@ def _objects(drive: _Drive) -> tuple[tuple[TrackedObject, ...], list[str]]:
             continue
         label = categories.get(known[name]["category_token"], {"name": "unknown"})["name"]
         pose = _pose({"token": f"a box of {name}", **row}, path)
-        size = finite_numbers(row["size"], path, f"the size of {name}", 3)
-        width, length, height = size.tolist()
-        if min(width, length, height) <= 0:
-            raise broken(f"{path}:", f"a box of {name} has no size")
+        width, length, height = box_size(row["size"], path, f"a box of {name}")
         sample = row["sample_token"]
         time = drive.stamps[sample]
         if sample in scanners:

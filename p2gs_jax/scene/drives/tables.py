@@ -104,12 +104,12 @@ def read_scan(path: Path, columns: int, what: str) -> Float32[np.ndarray, "n c"]
     return values.reshape(-1, columns)
 
 
-def box_size(sides: Iterable[Any], path: Path) -> tuple[float, float, float]:
-    """Return length, width and height of a box; UserError: they are not three positive numbers."""
-    length, width, height = finite_numbers(sides, path, "the size of a box", 3).tolist()
-    if min(length, width, height) <= 0:
-        raise broken(f"{path}:", "a box has a side of 0 m")
-    return length, width, height
+def box_size(sides: Iterable[Any], path: Path, box: str = "a box") -> tuple[float, float, float]:
+    """Return the sides of a box in their order; UserError: they are not three positive numbers."""
+    first, second, third = finite_numbers(sides, path, f"the size of {box}", 3).tolist()
+    if min(first, second, third) <= 0:
+        raise broken(f"{path}:", f"{box} has a side of 0 m")
+    return first, second, third
 
 
 def finite_numbers(
