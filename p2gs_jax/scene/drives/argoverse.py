@@ -165,7 +165,7 @@ def _objects(car: _Car) -> tuple[tuple[TrackedObject, ...], list[str]]:
     table = tables.read_feather(path, columns)
     times, size = car.seconds(table.whole(STAMP)), table.stacked(SIZE)
     if not (size > 0).all():
-        raise broken(f"{path}:", "a box has no size")
+        raise broken(f"{path}:", "a box has a side of 0 m")
     cars, known = car.trajectory.at(times)
     poses = cars @ _poses(table, "box")
     names, labels = table["track_uuid"], table["category"]
