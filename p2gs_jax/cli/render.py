@@ -97,10 +97,10 @@ class Render:
         cameras = None if cameras is None else near_scene(cameras, fitted.scene.origin)
         out = self.out or fitted.folder / "renders" / _default_name(self, fitted.scene)
         _check_place(out, self.overwrite)
-        kept = out / "cameras.json"
-        why = f"--trajectory names {kept}, which would be replaced"
-        other = kept.resolve() != Path(self.trajectory).resolve()
-        check(other, why, fix="choose another place with --out")
+        list_of_cameras = out / "cameras.json"
+        apart = list_of_cameras.resolve() != Path(self.trajectory).resolve()
+        why = f"--trajectory names {list_of_cameras}, which would be replaced"
+        check(apart, why, fix="choose another place with --out")
         with TerminalReporter() as reporter:
             job = (
                 panoramas_of(self, fitted)
@@ -110,17 +110,17 @@ class Render:
             for note in (*fitted.notes, *job.notes):
                 reporter.message(note)
             # An earlier render may have had more frames.
-            if kept.is_file():
-                for shot in read_cameras(kept):
+            if list_of_cameras.is_file():
+                for shot in read_cameras(list_of_cameras):
                     remove_frame(out, shot.name)
-                kept.unlink()
+                list_of_cameras.unlink()
             reporter.stage("Rendering", 0, job.count)
             with open_frames(out, job.size, self.fps or FPS) as write:
                 for done, frame in enumerate(job.frames):
                     write(frame)
                     reporter.stage("Rendering", done + 1, job.count)
             if job.shots and not is_video(out):
-                write_cameras(kept, job.shots)
+                write_cameras(list_of_cameras, job.shots)
         count, seconds = count_of(job.count, "frame"), time.monotonic() - begin
         PlainConsole().print(f"{count} in {seconds:.1f} s: {out}", soft_wrap=True)
         return 0

@@ -145,8 +145,7 @@ def _is_finished(folder: Path, scene: Path, cfg: FitConfig) -> bool:
     UserError: its photographs were replaced since it began.
     """
     files = RunFolder(folder)
-    begun = files.metrics.exists() and files.config.exists()
-    if check_run_dir(folder, True, cfg) or not begun:
+    if check_run_dir(folder, True, cfg) or not (files.config.exists() and files.metrics.exists()):
         return False
     require_as_begun(folder, read_scene(folder, scene), cfg)
     return read_config(files.config)[1].evaluation == cfg.evaluation

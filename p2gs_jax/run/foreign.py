@@ -154,8 +154,9 @@ def _with_developed_names(
 ) -> photometry_files.PhotometryFile:
     """Return the photometry of a calibration by the names of its developed photographs."""
     row_of = row_finder(scene.views, folder / DEVELOPED)
-    rows = [row_of(row["image"]) for row in _developed(folder)]
-    named = zip(saved["views"], rows, strict=True)
+    with readable(folder / DEVELOPED, AGAIN):
+        rows = [row_of(row["image"]) for row in _developed(folder)]
+        named = list(zip(saved["views"], rows, strict=True))
     views = [v | {"image": scene.views[row].name} for v, row in named if row is not None]
     return {**saved, "views": views}  # pyright: ignore[reportReturnType]
 

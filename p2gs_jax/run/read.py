@@ -330,8 +330,11 @@ def photometry_of(
 
 def require_as_begun(folder: Path, scene: Scene, cfg: FitConfig) -> None:
     """Raise UserError: a run began with other photographs, cameras or known exposures than now."""
+    known = cfg.photometry.known
+    if known not in (None, "exif") and not Path(known).is_file():
+        return  # the exposures are part of the key, and their file was moved
     begun = read_config(RunFolder(folder).config)[0].get("photographs")
-    if begun != recognition_key(scene.views, cfg.photometry.known):
+    if begun != recognition_key(scene.views, known):
         why = f"{folder} was begun with other photographs, cameras, held-out views or known "
         why += f"exposures than {scene.root} and the options name now."
         raise UserError(why, fix="restore them as they were, or fit again in another folder")
