@@ -118,10 +118,7 @@ def preset(name: PresetName) -> FitConfig:
 
     The presets are `robust`; `paper` (as printed, lambda_exp 0.01) and `paper_appendix` (0.1);
     baselines on display values (`3dgs...`, `ppisp`, `luminance_gs`); `ppisp_solved`
-    (docs/baselines.md).
-
-    Raises:
-        UserError: there is no such preset.
+    (docs/baselines.md). UserError: there is no such preset.
     """
     if name not in PRESETS:
         fix = f"choose {', '.join(get_args(PresetName))}"

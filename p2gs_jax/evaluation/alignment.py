@@ -49,8 +49,7 @@ def exposure_error(
 ) -> ExposureError:
     """Return the errors of exposures against the true ones, after gauges are removed.
 
-    Raises:
-        ValueError: an exposure is not positive.
+    ValueError: an exposure is not positive.
     """
     exposures, truth = np.asarray(exposures, np.float64), np.asarray(truth, np.float64)
     if (exposures <= 0).any() or (truth <= 0).any():

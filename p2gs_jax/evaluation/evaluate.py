@@ -115,10 +115,7 @@ def evaluate(
     moving Gaussians. For the row of a view, `reference` returns the photograph under the common
     exposure, and `radiance` the true linear radiance at the size of the photographs, or None. With
     weights, every comparison with a photograph has `lpips`. `on_progress` receives the number of
-    views done, and the number of all views.
-
-    Raises:
-        UserError: an image is too small for LPIPS.
+    views done, and the number of all views. UserError: an image is too small for LPIPS.
     """
     judge = Judge(scene, store, params, cfg, lpips_weights, reference)
     gaussians = jax.device_put(params.gaussians)

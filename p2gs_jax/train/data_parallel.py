@@ -62,8 +62,7 @@ def _counted(devices: Count) -> int:
 def with_a_view_each(cfg: FitConfig, devices: Count) -> FitConfig:
     """Return a configuration with one view per device, unless it sets a batch size already.
 
-    Raises:
-        UserError: JAX sees fewer devices.
+    UserError: JAX sees fewer devices.
     """
     count = _counted(devices)
     if count == 1 or cfg.train.batch > 1:
@@ -75,9 +74,7 @@ def mesh_of(cfg: FitConfig, devices: Count = 1) -> Mesh | None:
     """Return the mesh of a fit; None for steps of one view on one device.
 
     A batch is divided over devices by views; a single view is divided over the cores of a CPU.
-
-    Raises:
-        UserError: JAX sees fewer devices, or the batch is not a multiple of their number.
+    UserError: JAX sees fewer devices, or the batch is not a multiple of their number.
     """
     count, batch = _counted(devices), cfg.train.batch
     if batch == 1 and count == 1:

@@ -87,18 +87,12 @@ class TrainingStep:
         mask: Bool[Array, "h w"] | None = None,
         progress: float = 0.0,
     ) -> tuple[states.FitState, StepReport]:
-        """Return the state after a step of one view, and its report; the state is donated.
+        """Return the state after a step of one view, and its report; `state` is donated.
 
-        Args:
-            state: the state before the step.
-            camera: camera of the view.
-            photograph: display values in [0, 1], or unsigned integers whose largest value means 1.
-            view: row in `Photometry`.
-            mask: True = use; None: all pixels.
-            progress: completed fraction of the run, which sets learning rates and harmonics degree.
-
-        Raises:
-            DivergenceError: a loss term or gradient is not finite.
+        `photograph` has display values in [0, 1], or unsigned integers whose largest value means 1;
+        `view` is its row in `Photometry`. Pixels where `mask` is True count (None: all). `progress`
+        is the completed fraction of the run, which sets learning rates and harmonics degree.
+        DivergenceError: a loss term or gradient is not finite.
         """
         cfg, size = self.cfg, (camera.width, camera.height)
         mask = jnp.ones(size[::-1], bool) if mask is None else jnp.asarray(mask)
