@@ -112,4 +112,4 @@ def _name(values: dict, index: int) -> str:
     parts = PurePosixPath(name).parts if isinstance(name, str) else ()
     if not parts or ".." in parts or PurePosixPath(name).is_absolute() or {"\\", "\0"} & {*name}:
         raise ValueError(f"has the name {name!r}, which is not a file within the output folder")
-    return name
+    return PurePosixPath(name).as_posix()

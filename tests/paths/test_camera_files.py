@@ -75,7 +75,7 @@ def test_invalid_and_missing_files_and_equal_names_are_refused(tmp_path):
             read_cameras(save(tmp_path / "c.json", content))
     with pytest.raises(UserError, match=r"nowhere\.json"):
         read_cameras(tmp_path / "nowhere.json")
-    twice = [{**GOOD, "name": "x"}, GOOD, {**GOOD, "name": "x"}]
+    twice = [{**GOOD, "name": "x"}, GOOD, {**GOOD, "name": "./x"}]
     with pytest.raises(UserError, match="0 and 2"):
         read_cameras(save(tmp_path / "c.json", twice))
     nested = [{**GOOD, "name": name} for name in ("a", "a.png/b")]

@@ -237,7 +237,10 @@ class _Converter:
             if kind == "exr":
                 light = self._read(path).light
                 assert light is not None
-                brightest = max(brightest, float(np.percentile(light[::3, ::3].max(2), _BRIGHT)))
+                values = light[::3, ::3].max(2)
+                values = values[values < readers.INFINITE]
+                if values.size:
+                    brightest = max(brightest, float(np.percentile(values, _BRIGHT)))
         if not brightest or _DARK <= brightest <= 1.001:
             return 1.0
         return 2.0 ** -math.ceil(math.log2(brightest))

@@ -51,6 +51,7 @@ _SENSITIVITIES = (_ISO, 0x8833, 0x8832, 0x8831)
 # APEX values (log2, stops) from this size on are broken.
 _SHUTTER_SPEED, _APERTURE, _LARGEST_APEX = 0x9201, 0x9202, 32.0
 _MAKE, _MODEL, _SERIAL, _LENS = 0x010F, 0x0110, 0xA431, 0xA434
+INFINITE = np.finfo(np.float32).max  # stands for infinite light
 # Last parts of the names of layers that hold the picture in OpenEXR; without a layer it is "".
 _PICTURES = ("", "combined", "beauty", "rgba")
 # Attributes of LibRaw.
@@ -288,6 +289,9 @@ def read_exr(path: Path) -> Picture:
     else:
         why = f"has the channels {', '.join(sorted(channels))}."
         raise broken(path, why, "photographs need R, G and B, or Y")
+    # Infinite light is saturated; NaN is black.
+    invalid, saturated = int(np.isnan(light).any(2).sum()), np.isposinf(light).any(2)
+    light = np.nan_to_num(light, nan=0.0, posinf=0.0, neginf=0.0)
     primaries = header.get("chromaticities")
     if primaries is not None and len(np.ravel(primaries)) == 8:
         matrix = icc.to_srgb_matrix(tuple(np.ravel(primaries)))
@@ -296,10 +300,9 @@ def read_exr(path: Path) -> Picture:
     alpha = channels.get(f"{layer}A")
     if alpha is not None:
         alpha = np.clip(np.nan_to_num(alpha.astype(np.float32)), 0, 1)
-        light = light / np.maximum(alpha, 1e-6)[..., None]
-    # Infinite light is saturated; NaN is black.
-    invalid = int(np.isnan(light).any(2).sum())
-    light = np.nan_to_num(light, nan=0.0, posinf=float(np.finfo(np.float32).max), neginf=0.0)
+        # Light without opacity, as of a glow, belongs to no surface.
+        light = light / np.where(alpha > 1e-6, alpha, np.float32(np.inf))[..., None]
+    light[saturated] = INFINITE
     return Picture(light=light, alpha=alpha, exif=_exr_exif(header), invalid=invalid)
 
 

@@ -258,6 +258,20 @@ def test_nan_alpha_and_chromaticities_of_exr_are_converted(folder: Path) -> None
     assert light_of(c)[4, 4] == pytest.approx((0, 0.521, 0), abs=2e-3)
 
 
+def test_infinite_and_transparent_light_of_exr_is_not_the_brightest(folder: Path) -> None:
+    light = np.full((32, 32, 4), 0.5, np.float32)
+    light[..., 3] = 1
+    light[:4, :4, :3] = np.inf
+    light[8:12, :4] = (0.5, 0.5, 0.5, 0)  # a glow
+    rec2020 = (0.708, 0.292, 0.170, 0.797, 0.131, 0.046, 0.3127, 0.329)
+    made.write_exr(folder / "a.exr", light, "RGBA")
+    made.write_exr(folder / "b.exr", light, "RGBA", chromaticities=rec2020)
+    for path in converted(folder).paths:
+        assert light_of(path)[20, 20] == pytest.approx(0.5, abs=1e-3)
+        assert (light_of(path)[:4, :4] == 1).all()
+        assert (light_of(path)[8:12, :4] == 0).all()
+
+
 def write_channels(path: Path, channels: dict[str, np.ndarray]) -> None:
     with OpenEXR.File({"type": OpenEXR.scanlineimage}, channels) as file:
         file.write(str(path))

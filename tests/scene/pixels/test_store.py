@@ -135,6 +135,16 @@ def test_sizes_and_intrinsics(tmp_path):
     assert (K[0, 0] / w, K[1, 1] / h) == pytest.approx((60 / 1000, 60 / 751))
 
 
+def test_traces_of_jpeg_around_a_mask_do_not_count(tmp_path):
+    mask = np.full((48, 64), 255, np.uint8)
+    mask[11:29, 13:41] = 0
+    cv2.imwrite(str(tmp_path / "m.jpg"), mask, (cv2.IMWRITE_JPEG_QUALITY, 75))
+    _, valid = store_of(make_view(tmp_path / "a.png", noise(3), mask_path=tmp_path / "m.jpg")).get(
+        0
+    )
+    np.testing.assert_array_equal(valid > 0, mask > 0)
+
+
 def test_shrinking_averages_and_masks_conservatively(tmp_path):
     bgr, mask = noise(3), np.full((48, 64), 255, np.uint8)
     mask[5, 9] = 0
