@@ -24,6 +24,9 @@ ORTHOGONAL = 1e-3
 FAR = 100.0
 # Poses are extrapolated beyond the ends of their track by at most this time, seconds.
 LONGEST_BEYOND_S = 0.15
+# Poses are not interpolated over gaps longer than this time, seconds, and than this multiple of the
+# usual step. A car that turns is 0.3 m off its path after 1 s, and 3 m after 3 s.
+LONGEST_GAP_S, USUAL_STEPS = 1.0, 3.0
 # The cameras' right-hand axes span a plane if their RMS in its second direction is this large.
 SPANNING_RMS = 0.1
 # A direction over a shorter distance is noise, metres.
@@ -167,8 +170,9 @@ def interpolated(
     """Return poses at times, and which of these times [n] the track covers.
 
     Positions are linear in time, and rotations have a constant rate. Beyond an end the motion of
-    the nearest two poses continues for `LONGEST_BEYOND_S`, and then stops. Times are in seconds,
-    and the track's `times` rise.
+    the nearest two poses continues for `LONGEST_BEYOND_S`, and then stops. Inside a long gap
+    (`LONGEST_GAP_S`) only times this close to a pose are covered. Times are in seconds, and the
+    track's `times` rise.
     """
     times, at = np.asarray(times, np.float64), np.asarray(at, np.float64)
     begin, end = times[0] - LONGEST_BEYOND_S, times[-1] + LONGEST_BEYOND_S
@@ -177,7 +181,10 @@ def interpolated(
         return np.repeat(poses, len(at), 0), covered
     clipped = np.clip(at, begin, end)
     before = np.clip(np.searchsorted(times, clipped, side="right") - 1, 0, len(times) - 2)
-    share = (clipped - times[before]) / (times[before + 1] - times[before])
+    step, gaps = np.diff(times), (clipped - times[before], times[before + 1] - clipped)
+    longest = max(LONGEST_GAP_S, USUAL_STEPS * float(np.median(step)))
+    covered &= (step[before] <= longest) | (np.abs(gaps).min(0) <= LONGEST_BEYOND_S)
+    share = gaps[0] / step[before]
     first, second = poses[before], poses[before + 1]
     positions = first[:, :3, 3] + share[:, None] * (second[:, :3, 3] - first[:, :3, 3])
     start = Rotation.from_matrix(first[:, :3, :3])

@@ -315,7 +315,10 @@ def _frames(
         name = values.get("file_path") if isinstance(values, dict) else None
         if not isinstance(name, str) or not name:
             raise broken(f"{path}:", f'frame {i} has no "file_path"', FIX)
-        frames.append(_Frame(relative_name(path, name), {**data, **values}, path, split))
+        # The angle of a frame replaces a focal length of all frames.
+        own = {"fl_x", "fl_y"} if {"camera_angle_x", "camera_angle_y"} & values.keys() else {}
+        common = {key: value for key, value in data.items() if key not in own}
+        frames.append(_Frame(relative_name(path, name), common | values, path, split))
     return frames, data
 
 

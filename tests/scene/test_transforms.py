@@ -54,6 +54,12 @@ def test_frames_override_cameras_follow_folders_and_other_sizes_are_rescaled(tmp
     assert left.K[0, 0] == left.K[1, 1] == 50
     assert np.allclose(right.K, np.array([[60, 0, 19], [0, 61, 14], [0, 0, 1]]))
     assert right.distortion.coefficients == (0.1, 0, 0.01, 0)
+    # An angle of a frame replaces the common focal length.
+    angle = {"camera_angle_x": 2 * np.arctan(0.5)}
+    data = {**LENS, "fl_y": 50, "frames": frames("images/a.png", "images/b.png")}
+    data["frames"][1] |= angle
+    a, b = find_scene(write(tmp_path, data), CFG).views
+    assert (a.K[0, 0], b.K[0, 0], b.K[1, 1]) == pytest.approx((50, 40, 40))
     data = {"fl_x": 100, "w": 80, "h": 60, "frames": frames("images/a.png", "images/b.png")}
     scene = find_scene(write(tmp_path, data), CFG)
     assert np.allclose(scene.views[0].K, np.array([[50, 0, 20], [0, 50, 15], [0, 0, 1]]))

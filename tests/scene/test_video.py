@@ -281,6 +281,9 @@ def test_one_frame_or_no_motion_is_refused_and_half_a_file_is_read(tmp_path: Pat
     write_video(tmp_path / "still.mp4", [room(0)] * 30)
     with refused("1 of 30 frames would be used", "--every"):
         read(tmp_path / "still.mp4", tmp_path)
+    late = tmp_path / "late.mkv"
+    write_video(late, [room(0)] * 6, times=[5 + k / 30 for k in range(6)])
+    assert video.expected_frames(late) == 6
     path = tmp_path / "cut.mkv"
     write_video(path, [room(place) for place in WALK])
     data = path.read_bytes()

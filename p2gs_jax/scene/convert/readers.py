@@ -279,7 +279,7 @@ def read_exr(path: Path) -> Picture:
     layers = sorted(k[: -len("R")] for k in channels if k == "R" or k.endswith(".R"))
     pictures = [k for k in layers if k.rpartition(".")[0].rpartition(".")[2].lower() in _PICTURES]
     if len(layers) > 1 and len(pictures) != 1:
-        why = f"has the layers {', '.join(k.strip('.') for k in layers)}."
+        why = f"has the layers {', '.join(k.strip('.') or '(unnamed)' for k in layers)}."
         raise broken(path, why, "save it with one layer, that of the picture")
     layer = next(iter(pictures or layers), None)
     if layer is not None and {layer + "G", layer + "B"} <= channels.keys():
@@ -308,7 +308,7 @@ def read_exr(path: Path) -> Picture:
 
 def _exr_exif(header: dict) -> Image.Exif | None:
     names = ("expTime", "aperture", "isoSpeed")  # OpenEXR's standard attributes
-    time, aperture, iso = (float(header[n]) if header.get(n) else None for n in names)
+    time, aperture, iso = (_positive(header.get(name)) for name in names)
     return made_exif(ExifSettings(time, aperture, iso))
 
 
@@ -352,6 +352,8 @@ def _exr_size(path: Path, header: dict) -> tuple[int, int]:
         why = f"has {data[0]}x{data[1]} pixels at {data[2:]} in a frame of {frame[0]}x{frame[1]}, "
         why += "and intrinsics belong to the frame."
         raise broken(path, why, "save it without a crop or overscan")
+    if (ratio := header.get("pixelAspectRatio", 1)) != 1:
+        raise broken(path, f"has pixels with the aspect ratio {ratio:g}", "resample it to 1")
     return data[:2]
 
 

@@ -114,10 +114,12 @@ def _chosen_photographs(
     if not chosen:
         why = f"{recording.root} has no photograph of the chosen cameras and frames"
         raise UserError(why, fix="name other --cameras, or leave out --frames")
-    chosen.sort(key=lambda p: (p.camera, p.frame))
+    rows = len(chosen)
+    chosen = sorted({_name(p): p for p in chosen}.values(), key=lambda p: (p.camera, p.frame))
     existing = [p for p in chosen if p.embedded is not None or p.path.is_file()]
     missing = sorted({_name(p) for p in chosen} - {_name(p) for p in existing})
-    notes = [*recording.notes, *files.check_missing(missing, len(chosen), recording.root, cfg)]
+    notes = [*recording.notes, *counted(rows - len(chosen), "rows repeat a photograph.")]
+    notes += [*files.check_missing(missing, len(chosen), recording.root, cfg)]
     counts = {name: sum(p.camera == name for p in existing) for name in names}
     few = [f"{name} {count}" for name, count in counts.items() if count < len(frames)]
     if few:
@@ -188,7 +190,7 @@ def _read_sweeps(
         points, at = sweep.read()
         with np.errstate(over="ignore", invalid="ignore"):
             local = (points - origin).astype(np.float32)
-        finite = np.isfinite(local).all(1)
+        finite = np.isfinite(local).all(1) & np.isfinite(at)
         invalid += int((~finite).sum())
         local, at = local[finite], np.asarray(at, np.float64)[finite]
         if len(local) > most_each:

@@ -75,6 +75,8 @@ def _camera(folder: Path, photograph: Path) -> RigCamera:
         fx, fy, cx, cy = tables.finite_numbers(values, path, "fx fy cx cy").tolist()
     except (KeyError, TypeError):
         raise broken(path, "lacks fx, fy, cx or cy") from None
+    if min(fx, fy) <= 0:
+        raise broken(path, f"has the focal lengths {fx:g} and {fy:g}, which are not positive")
     size = image_size(photograph)
     if np.abs([cx / CALIBRATED[0] - 0.5, cy / CALIBRATED[1] - 0.5]).max() < 0.1:
         size = CALIBRATED

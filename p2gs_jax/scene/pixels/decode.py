@@ -214,9 +214,9 @@ def _decode_mask(view: View) -> Bool[np.ndarray, "h w"]:
         raise broken(f"wrong size: the mask {view.mask_path}", why, fix)
     raw = _read_raster(view.mask_path)
     colours = raw if raw.ndim == 2 else raw[..., : 3 if raw.shape[2] >= 3 else 1].max(axis=2)
-    # Around the edges of a mask, JPEG leaves small values.
-    jpeg = view.mask_path.suffix.lower() in (".jpg", ".jpeg")
-    mask = colours > (np.iinfo(colours.dtype).max // 2 if jpeg else 0)
+    # Around the edges of a mask, lossy formats leave small values.
+    lossy = view.mask_path.suffix.lower() in (".jpg", ".jpeg", ".jfif", ".webp")
+    mask = colours > (np.iinfo(colours.dtype).max // 2 if lossy else 0)
     if raw.ndim == 3 and raw.shape[2] in (2, 4):
         # Transparent pixels do not count. If a mask is black everywhere, its alpha is the mask.
         opaque = raw[..., -1] > 0

@@ -265,7 +265,8 @@ def test_infinite_and_transparent_light_of_exr_is_not_the_brightest(folder: Path
     light[8:12, :4] = (0.5, 0.5, 0.5, 0)  # a glow
     rec2020 = (0.708, 0.292, 0.170, 0.797, 0.131, 0.046, 0.3127, 0.329)
     made.write_exr(folder / "a.exr", light, "RGBA")
-    made.write_exr(folder / "b.exr", light, "RGBA", chromaticities=rec2020)
+    odd = {"expTime": "1/50", "isoSpeed": float("nan")}  # values that are not numbers do not count
+    made.write_exr(folder / "b.exr", light, "RGBA", chromaticities=rec2020, **odd)
     for path in converted(folder).paths:
         assert light_of(path)[20, 20] == pytest.approx(0.5, abs=1e-3)
         assert (light_of(path)[:4, :4] == 1).all()
@@ -292,6 +293,8 @@ def test_unsupported_and_broken_files_are_refused(folder: Path) -> None:
 
     (folder / "a.nef").write_bytes(b"II*\0" + bytes(range(256)) * 40)
     refuse("a.nef", r"does not support .*a\.nef", "DNG Converter")
+    made.write_exr(folder / "a.exr", np.ones((8, 8, 3), np.float32), pixelAspectRatio=2.0)
+    refuse("a.exr", "pixels with the aspect ratio 2", "resample it")
     (folder / "a.exr").write_bytes(b"\x76\x2f\x31\x01 and nothing")
     refuse("a.exr", r"a\.exr is not a readable OpenEXR")
     made.write_exr(folder / "b.exr", np.ones((8, 8, 1), np.float32), "Z")

@@ -14,7 +14,7 @@ from p2gs_jax.config import DataConfig
 from p2gs_jax.scene.drives.assemble import assemble, chosen_frames
 from p2gs_jax.scene.drives.lidar import owners, seeds
 from p2gs_jax.scene.drives.objects import Box, tracks
-from p2gs_jax.scene.drives.recording import SweepPoints
+from p2gs_jax.scene.drives.recording import SweepPoints, Trajectory
 from p2gs_jax.scene.split import assign_split
 from p2gs_jax.types import Lidar, TrackedObject
 
@@ -67,6 +67,30 @@ def test_laser_points_belong_to_moving_objects_or_the_static_scene(drive):
     assert np.abs(np.abs(scene.points[:, 1] + scene.origin[1] - FAR[1]) - WALL).max() < 1e-3
     assert scene.point_colors is None
     assert f"{FRAMES} LiDAR points are not finite numbers and are left out." in scene.notes
+
+
+def test_repeated_photographs_and_laser_points_without_time_are_counted(drive):
+    sweep = drive.sweeps[0]
+    points, times = sweep.read()
+    times = np.where(np.arange(len(times)) < 5, np.nan, times)
+    timeless = replace(sweep, read=lambda: SweepPoints(points, times))
+    again = [*drive.photographs, drive.photographs[3]]
+    scene = assemble(replace(drive, photographs=again, sweeps=(timeless, *drive.sweeps[1:])), PLAIN)
+    assert len({v.name for v in scene.views}) == len(scene.views) == 2 * FRAMES
+    assert "1 rows repeat a photograph." in scene.notes
+    assert f"{FRAMES + 5} LiDAR points are not finite numbers and are left out." in scene.notes
+    assert (scene.lidar.objects == 0).sum() >= 60 * FRAMES - 5
+
+
+def test_poses_are_not_interpolated_over_long_gaps():
+    times = np.array([0.0, 0.1, 0.2, 0.3, 3.3, 3.4])
+    drives = Trajectory(times, np.tile(np.eye(4), (6, 1, 1)))
+    at = np.array([-0.1, 0.15, 0.4, 0.6, 2.0, 3.2, 3.35, 3.6])
+    covered = [True, True, True, False, False, True, True, False]
+    assert drives.at(at)[1].tolist() == covered
+    # Boxes of keyframes are 0.5 s apart, and some are missing.
+    slow = Trajectory(np.array([0, 0.5, 1.0, 2.5]), np.tile(np.eye(4), (4, 1, 1)))
+    assert slow.at(np.array([0.25, 1.7]))[1].all()
 
 
 def test_cameras_and_frames_are_chosen_and_lidar_may_be_left_out(drive):

@@ -212,6 +212,7 @@ REFUSED = {
         (FRONT / "poses.json", lambda held: [NO_HEADING], "the pose of frame 0 lacks"),
         (FRONT / "poses.json", lambda held: [BENT], "frame 0 is not a unit"),
         (FRONT / "intrinsics.json", lambda held: {"fx": 60}, "lacks"),
+        (FRONT / "intrinsics.json", lambda held: held | {"fx": -50}, "which are not positive"),
         (FRONT / "timestamps.json", lambda held: ["now", "a", "b"], "entry 0 should be finite"),
         (CUBOIDS, lambda rows: [{"uuid": "a"}], "no column 'position.x'"),
         (CUBOIDS, every(**{"dimensions.x": 0.0}), "positive sizes"),
