@@ -136,11 +136,8 @@ def check_options(cfg: FitConfig) -> None:
         plain = " ".join(f"{o} {value}" for o, value in zip(options, given.values(), strict=True))
         raise UserError(why, fix=f"add --photometry.start tracks, or {plain}")
     regularizers, relative = cfg.loss.regularizers, cfg.loss.relative_exposure
-    of_exposures = {
-        name: getattr(regularizers, name)
-        for name in ("exposure_scale", "exposure_variance", "gamma_prior")
-    }
-    pulls = [f"regularizers.{name}" for name, value in of_exposures.items() if value is not None]
+    names = ("exposure_scale", "exposure_variance", "gamma_prior")
+    pulls = [f"regularizers.{name}" for name in names if getattr(regularizers, name) is not None]
     # The other form of this loss also reaches the Gaussians.
     if relative.weight is not None and relative.form == "observed_ldr":
         pulls.append("relative-exposure.weight")

@@ -24,8 +24,8 @@ ORTHOGONAL = 1e-3
 FAR = 100.0
 # Poses are extrapolated beyond the ends of their track by at most this time, seconds.
 LONGEST_BEYOND_S = 0.15
-# Poses are not interpolated over gaps longer than this time, seconds, and than this multiple of the
-# usual step. A car that turns is 0.3 m off its path after 1 s, and 3 m after 3 s.
+# Poses are not interpolated over a gap that is longer than both this time, seconds, and this
+# multiple of the usual step. A car that turns is 0.3 m off its path after 1 s, 3 m after 3 s.
 LONGEST_GAP_S, USUAL_STEPS = 1.0, 3.0
 # The cameras' right-hand axes span a plane if their RMS in its second direction is this large.
 SPANNING_RMS = 0.1
@@ -181,10 +181,10 @@ def interpolated(
         return np.repeat(poses, len(at), 0), covered
     clipped = np.clip(at, begin, end)
     before = np.clip(np.searchsorted(times, clipped, side="right") - 1, 0, len(times) - 2)
-    step, gaps = np.diff(times), (clipped - times[before], times[before + 1] - clipped)
+    step, apart = np.diff(times), (clipped - times[before], times[before + 1] - clipped)
     longest = max(LONGEST_GAP_S, USUAL_STEPS * float(np.median(step)))
-    covered &= (step[before] <= longest) | (np.abs(gaps).min(0) <= LONGEST_BEYOND_S)
-    share = gaps[0] / step[before]
+    covered &= (step[before] <= longest) | (np.abs(apart).min(0) <= LONGEST_BEYOND_S)
+    share = apart[0] / step[before]
     first, second = poses[before], poses[before + 1]
     positions = first[:, :3, 3] + share[:, None] * (second[:, :3, 3] - first[:, :3, 3])
     start = Rotation.from_matrix(first[:, :3, :3])

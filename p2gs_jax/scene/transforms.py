@@ -315,10 +315,12 @@ def _frames(
         name = values.get("file_path") if isinstance(values, dict) else None
         if not isinstance(name, str) or not name:
             raise broken(f"{path}:", f'frame {i} has no "file_path"', FIX)
-        # The angle of a frame replaces a focal length of all frames.
-        own = {"fl_x", "fl_y"} if {"camera_angle_x", "camera_angle_y"} & values.keys() else {}
-        common = {key: value for key, value in data.items() if key not in own}
-        frames.append(_Frame(relative_name(path, name), common | values, path, split))
+        merged = {**data, **values}
+        if {"camera_angle_x", "camera_angle_y"} & values.keys() and not _is_fisheye(merged):
+            # The angle of a frame replaces the focal lengths of all frames.
+            common = {k: v for k, v in data.items() if k not in ("fl_x", "fl_y")}
+            merged = {**common, **values}
+        frames.append(_Frame(relative_name(path, name), merged, path, split))
     return frames, data
 
 
@@ -382,11 +384,16 @@ def _view(frame: _Frame, folder: Path, name: str) -> tuple[View, bool]:
     return replace(view, split=frame.split), (width, height) != size
 
 
+def _is_fisheye(values: Mapping[str, Any]) -> bool:
+    """Return whether a camera is a fisheye, whose angle gives no focal length."""
+    return str(values.get("camera_model")).upper() == _FISHEYE or bool(values.get("is_fisheye"))
+
+
 def _lens(
     path: Path, values: Mapping[str, Any], name: str, width: int, height: int
 ) -> tuple[Float[np.ndarray, "3 3"], Distortion | None]:
     model = str(values.get("camera_model", "OPENCV")).upper()
-    fisheye = model == _FISHEYE or bool(values.get("is_fisheye"))
+    fisheye = _is_fisheye(values)
     if model not in (*_PERSPECTIVE, _FISHEYE):
         known = ", ".join(sorted((*_PERSPECTIVE, _FISHEYE)))
         fix = CUT if model == "EQUIRECTANGULAR" else _UNDISTORT

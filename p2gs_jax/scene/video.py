@@ -189,10 +189,10 @@ def expected_frames(path: Path) -> int | None:
         if stream.frames:
             return int(stream.frames)
         if container.duration and stream.average_rate:
-            # Matroska counts from 0, also if the first frame is later.
-            late = container.start_time or 0 if "matroska" in container.format.name else 0
-            seconds = (container.duration - late) / av.time_base
-            return round(seconds * float(stream.average_rate))
+            duration = container.duration
+            if "matroska" in container.format.name:  # it counts from 0, not from the first frame
+                duration -= container.start_time or 0
+            return round(duration / av.time_base * float(stream.average_rate))
     return None
 
 

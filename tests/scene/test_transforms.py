@@ -60,6 +60,9 @@ def test_frames_override_cameras_follow_folders_and_other_sizes_are_rescaled(tmp
     data["frames"][1] |= angle
     a, b = find_scene(write(tmp_path, data), CFG).views
     assert (a.K[0, 0], b.K[0, 0], b.K[1, 1]) == pytest.approx((50, 40, 40))
+    # That of a fisheye does not.
+    _, b = find_scene(write(tmp_path, data | {"is_fisheye": True}), CFG).views
+    assert b.K[0, 0] == b.K[1, 1] == 50
     data = {"fl_x": 100, "w": 80, "h": 60, "frames": frames("images/a.png", "images/b.png")}
     scene = find_scene(write(tmp_path, data), CFG)
     assert np.allclose(scene.views[0].K, np.array([[50, 0, 20], [0, 50, 15], [0, 0, 1]]))

@@ -31,8 +31,8 @@ _ROWS = 256  # rows of a photograph that are converted at once
 BYTES_PER_PIXEL, SHARE = 40, 0.5
 # The largest relative difference between the aspect ratios of a mask and its photograph.
 _ASPECT_TOLERANCE = 0.01
-# The largest values of cameras with 10, 12 and 14 bits. A photograph of 16 bits is taken for one of
-# these if its largest value is one of them and is held by at least this share of its values.
+# The largest values of cameras with 10, 12 and 14 bits. A photograph of 16 bits is from one of them
+# if its largest value is one of these, and if more than this share of its values equal it.
 _SENSOR_WHITES, _CLIPPED = (1023, 4095, 16383), 1e-4
 # TIFF's tag for the meaning of the fourth channel; its colours are multiplied by associated alpha.
 _EXTRA_SAMPLES, _ASSOCIATED = 338, (1,)
@@ -256,8 +256,10 @@ def _read_raster(path: Path, *, colours: bool = False) -> np.ndarray:
 
 def _require_full_range(path: Path, raw: UInt[np.ndarray, "..."]) -> None:
     """Raise UserError for values of 10, 12 or 14 bits in 16 bits, whose white would be dark."""
+    if raw.dtype != np.uint16:
+        return
     most = raw.max()
-    if most in _SENSOR_WHITES and raw.dtype == np.uint16 and (raw == most).mean() > _CLIPPED:
+    if most in _SENSOR_WHITES and (raw == most).mean() > _CLIPPED:
         why = f"has 16 bits, but its white is {most}: its values have {int(most).bit_length()} bits"
         raise broken(path, why, f"multiply its values by 65535 / {most}")
 
