@@ -1,8 +1,9 @@
 """Colours: transfer functions, primaries and ICC profiles, converted to light or to sRGB.
 
-Sources: ITU-R BT.2100-2 (PQ and HLG, tables 4 and 5), BT.2020, IEC 61966-2-1, ICC.1:2022. Only
-profiles with a matrix and a curve per channel are applied (ICC.1:2022, 8.3.3), as all cameras and
-phones write them. Other profiles are ignored, and a note says so.
+Sources: ITU-R BT.2100-2 (PQ and HLG, tables 4 and 5), BT.2020, IEC 61966-2-1, ICC.1:2022, and the
+third edition of PNG (4.3, which chunk counts; 11.3.2, their contents). Only ICC profiles with a
+matrix and a curve per channel are applied (ICC.1:2022, 8.3.3), as all cameras and phones write
+them. Other profiles are ignored, and a note says so.
 """
 
 from __future__ import annotations
@@ -54,6 +55,10 @@ _INVISIBLE = 0.004
 _INTEROPERABILITY, _INTEROP_INDEX = 0xA005, 1
 _DCF_OPTION = "R03"
 _ENTRIES = 1024
+_GRID = np.linspace(0, 1, _ENTRIES)[:, None]
+_PNG_NAME = "the colour space of their PNG headers"
+# The value in PNG's chunk gAMA that stands for sRGB's curve, which is nearly this power.
+_PNG_SRGB = 0.45455
 
 
 def to_light(signal: Float[np.ndarray, "..."], transfer: Transfer) -> Float[np.ndarray, "..."]:
@@ -107,9 +112,12 @@ class Profile:
 
 def profile_of(image: Image.Image) -> Profile | None:
     """Return the colour space in the header of a photograph; None: sRGB, grey or unknown."""
+    coded = _cicp(image) if image.format == "PNG" else b""
     data = image.info.get("icc_profile")
-    if data:
+    if data and not coded:
         return read_profile(bytes(data))
+    if image.format == "PNG":
+        return _png_profile(image.info, coded)
     try:
         index = image.getexif().get_ifd(_INTEROPERABILITY).get(_INTEROP_INDEX)
     except Exception:  # malformed EXIF raises many kinds of errors
@@ -119,7 +127,7 @@ def profile_of(image: Image.Image) -> Profile | None:
 
 def adobe_rgb() -> Profile:
     """Return Adobe RGB (1998)."""
-    curve = np.linspace(0, 1, _ENTRIES)[:, None] ** (563 / 256)
+    curve = _GRID ** (563 / 256)
     matrix = np.linalg.inv(rgb_to_xyz(BT709)) @ rgb_to_xyz(ADOBE_RGB)
     return Profile("Adobe RGB (1998)", np.repeat(curve, 3, 1), matrix)
 
@@ -139,10 +147,40 @@ def read_profile(data: bytes) -> Profile | None:
         return None
     srgb, columns = rgb_to_xyz(BT709), np.stack([xyz for xyz, _ in colorants], 1)
     matrix = np.linalg.inv(srgb) @ adapted(_PCS_WHITE, srgb.sum(1)) @ columns
-    decode, grid = np.stack(curves, 1), np.linspace(0, 1, _ENTRIES)[:, None]
-    curves_alike = np.abs(srgb_encode(decode) - grid).max() < _INVISIBLE
+    return _unless_srgb(name, np.stack(curves, 1), matrix)
+
+
+def _unless_srgb(
+    name: str, decode: Float[np.ndarray, "n 3"], matrix: Float[np.ndarray, "3 3"]
+) -> Profile | None:
+    curves_alike = np.abs(srgb_encode(decode) - _GRID).max() < _INVISIBLE
     is_srgb = curves_alike and np.abs(matrix - np.eye(3)).max() < _INVISIBLE
     return None if is_srgb else Profile(name, decode, matrix)
+
+
+def _cicp(image: Image.Image) -> bytes:
+    """Return the chunk of a PNG that Pillow skips, which states codes of H.273, or nothing."""
+    file: Any = image.fp
+    position = file.tell()
+    file.seek(0)
+    head = file.read(position).partition(b"IDAT")[0]
+    file.seek(position)
+    return head.partition(b"cICP")[2][:4]
+
+
+def _png_profile(info: dict, coded: bytes) -> Profile | None:
+    """Return the colour space in a PNG's chunk cICP, or in gAMA and cHRM if it has no sRGB."""
+    curve, primaries = srgb_decode(_GRID), BT709
+    if coded:
+        primaries = PRIMARIES.get(coded[0], BT709)
+        curve = to_light(_GRID, TRANSFERS[coded[1]]) if coded[1] in TRANSFERS else curve
+    elif "srgb" not in info:
+        gamma, white_first = info.get("gamma", 0), info.get("chromaticity", ())
+        if gamma > 0 and abs(gamma / _PNG_SRGB - 1) > 0.02:
+            curve = _GRID ** (1 / gamma)
+        if len(white_first) == 8 and min(white_first[1::2]) > 0:
+            primaries = (*white_first[2:], *white_first[:2])
+    return _unless_srgb(_PNG_NAME, np.repeat(curve, 3, 1), to_srgb_matrix(primaries))
 
 
 def to_srgb(pixels: UInt[np.ndarray, "h w 3"], profile: Profile) -> UInt[np.ndarray, "h w 3"]:
@@ -154,9 +192,8 @@ def to_srgb(pixels: UInt[np.ndarray, "h w 3"], profile: Profile) -> UInt[np.ndar
         return pixels
     top = np.iinfo(pixels.dtype).max
     levels = np.arange(top + 1) / top
-    grid = np.linspace(0, 1, _ENTRIES)
-    table = np.stack([np.interp(levels, grid, c) for c in profile.decode.T], 1).astype(np.float32)
-    light = np.stack([table[pixels[..., c], c] for c in range(3)], -1)
+    table = np.stack([np.interp(levels, _GRID[:, 0], c) for c in profile.decode.T], 1)
+    light = np.stack([table.astype(np.float32)[pixels[..., c], c] for c in range(3)], -1)
     return encode_16(light @ profile.matrix.T.astype(np.float32))
 
 
@@ -167,7 +204,7 @@ def coded_profile(code: int) -> Profile | None:
     """
     if code not in PRIMARIES:
         return None
-    curve = srgb_decode(np.linspace(0, 1, _ENTRIES))[:, None]
+    curve = srgb_decode(_GRID)
     return Profile("coded", np.repeat(curve, 3, 1), to_srgb_matrix(PRIMARIES[code]))
 
 

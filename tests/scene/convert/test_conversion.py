@@ -3,14 +3,18 @@
 import dataclasses
 import io
 import json
+import struct
 import sys
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import OpenEXR
 import pytest
 from PIL import Image, ImageCms, features
+from PIL.PngImagePlugin import PngInfo
 from scene.convert import made
 from scene.helpers import make_view, refused, write_image, write_tiny_model
 
@@ -19,6 +23,7 @@ from p2gs_jax.core.numerics import srgb_decode, srgb_encode
 from p2gs_jax.photometry.calibrate import options_of
 from p2gs_jax.run.scene_file import read_scene, write_scene
 from p2gs_jax.scene import ImageStore, load_scene
+from p2gs_jax.scene.convert import icc
 from p2gs_jax.scene.convert.convert import Converted, convert_photographs, with_originals
 from p2gs_jax.scene.convert.icc import adobe_rgb, colour_notes, profile_of, read_profile, to_srgb
 from p2gs_jax.scene.convert.readers import exif_evs, exif_of_raw, read_exif_settings
@@ -443,6 +448,39 @@ def test_alpha_beside_a_profile_is_kept_and_grey_is_unchanged(tmp_path: Path) ->
     assert (store.stored(1)[0] == 77).all()
 
 
+def test_colours_in_the_header_of_a_png_are_converted(tmp_path: Path) -> None:
+    def numbers(values: Sequence[float]) -> bytes:
+        return struct.pack(f">{len(values)}I", *(round(1e5 * v) for v in values))
+
+    white_first = (*icc.DISPLAY_P3[6:], *icc.DISPLAY_P3[:6])
+    cases: dict[str, tuple[dict[bytes, bytes], Any, icc.Primaries]] = {
+        "linear": ({b"gAMA": numbers([1])}, lambda x: x, icc.BT709),
+        "p3": (
+            {b"gAMA": numbers([0.45455]), b"cHRM": numbers(white_first)},
+            srgb_decode,
+            icc.DISPLAY_P3,
+        ),
+        "pq": ({b"cICP": bytes([9, 16, 0, 1])}, lambda x: icc.to_light(x, "pq"), icc.BT2020),
+        "srgb": ({b"gAMA": numbers([1]), b"sRGB": b"\0"}, srgb_decode, icc.BT709),
+        "plain": ({b"gAMA": numbers([0.45455]), b"cHRM": numbers([0] * 8)}, srgb_decode, icc.BT709),
+    }
+    views = [make_view(tmp_path / f"{name}.png", size=(96, 64)) for name in cases]
+    for view, (chunks, _, _) in zip(views, cases.values(), strict=True):
+        header = PngInfo()
+        for key, data in chunks.items():
+            header.add(key, data)
+        Image.fromarray(PIXELS).save(view.image_path, pnginfo=header)
+    store = ImageStore(views, DataConfig())
+    for k, (_, decode, primaries) in enumerate(cases.values()):
+        pixels = store.stored(k)[0]
+        expected = decode(PIXELS / 255) @ icc.to_srgb_matrix(primaries).T
+        shown = pixels / np.iinfo(pixels.dtype).max
+        np.testing.assert_allclose(shown, icc.encode_16(expected) / 65535, atol=2e-3)
+    notes = colour_notes(view.image_path for view in views)
+    assert notes == ("3 photographs are in the colour space of their PNG headers; they are "
+                     "converted to sRGB.",)  # fmt: skip
+
+
 def test_adobe_rgb_is_recognised_by_exif_alone() -> None:
     exif = Image.Exif()
     exif.get_ifd(0x8769)[0xA005] = {1: "R03"}
@@ -452,7 +490,7 @@ def test_adobe_rgb_is_recognised_by_exif_alone() -> None:
         profile = profile_of(image)
     assert profile is not None
     assert profile.name == adobe_rgb().name
-    icc = read_profile(made.ADOBE_RGB)
-    assert icc is not None
-    assert icc.matrix is not None
-    assert adobe_rgb().matrix == pytest.approx(icc.matrix, abs=2e-3)
+    written = read_profile(made.ADOBE_RGB)
+    assert written is not None
+    assert written.matrix is not None
+    assert adobe_rgb().matrix == pytest.approx(written.matrix, abs=2e-3)
