@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter, defaultdict
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import count, islice
 from pathlib import PurePosixPath
 
 from p2gs_jax.config import CameraBy
@@ -42,11 +43,13 @@ def name_cameras(views: Sequence[View], by: CameraBy) -> tuple[View, ...]:
     named = devices if by == "exif" else models
     bases = [folder or name or "0" for folder, name in zip(folders, named, strict=True)]
     keys = list(zip(models, devices, strict=True))
-    parts: dict[str, dict[tuple, int]] = defaultdict(dict)
-    for base, key in zip(bases, keys, strict=True):
-        parts[base].setdefault(key, len(parts[base]) + 1)
+    parts: dict[str, dict[tuple, str]] = defaultdict(dict)
+    for base, key in dict.fromkeys(zip(bases, keys, strict=True)):
+        # Another folder may have the name of a part.
+        free = (name for n in count(1) if (name := f"{base} {n}") not in bases)
+        parts[base][key] = next(islice(free, len(parts[base]), None))
     return tuple(
-        replace(v, camera=base if len(parts[base]) == 1 else f"{base} {parts[base][key]}")
+        replace(v, camera=base if len(parts[base]) == 1 else parts[base][key])
         for v, base, key in zip(views, bases, keys, strict=True)
     )
 

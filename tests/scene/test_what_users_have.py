@@ -268,10 +268,17 @@ FOLDER = [f"{k}.jpg" for k in range(6)]
 RIG = [f"rig1/camera{c}/{k}.jpg" for c in (1, 2) for k in range(3)]
 PAIR = ["l/a.jpg", "l/b.jpg", "r/a.jpg", "r/b.jpg"]
 CAMERAS = {"models": list("1122"), "exif": list("ABAB")}
+SIMILAR = [*(f"cam/{k}.jpg" for k in range(4)), "cam 1/a.jpg", "cam 1/b.jpg"]
 LAYOUTS = {
     "rig": ("auto", RIG, {}, ["rig1/camera1"] * 3 + ["rig1/camera2"] * 3),
     "two models": ("auto", FOLDER, {"models": list("112211")}, list("112211")),
     "two devices": ("auto", FOLDER[:4], {"exif": list("ABAB")}, ["1 1", "1 2", "1 1", "1 2"]),
+    "a folder named like a part": (
+        "auto",
+        SIMILAR,
+        {"exif": list("ABABCC")},
+        ["cam 2", "cam 3"] * 2 + ["cam 1"] * 2,
+    ),
     "a camera for each": ("auto", FOLDER[:4], {"models": list("1234")}, ["0"] * 4),
     "a zoom in one folder": ("auto", PAIR, {"models": list("1234")}, ["l", "l", "r", "r"]),
     "by folder": ("folder", PAIR, CAMERAS, ["l", "l", "r", "r"]),
