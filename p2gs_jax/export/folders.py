@@ -191,9 +191,10 @@ def is_copied(view: View, path: Path) -> bool:
     The suffix of `path`, the orientation in EXIF, the mode or a colour profile may rule this out.
     """
     with contextlib.suppress(OSError), Image.open(view.image_path) as image:
+        plain = image.mode in MODES and profile_of(image) is None  # before pixels are read
         upright = image.getexif().get(ExifTags.Base.Orientation, 1) in (0, 1)
         same = view.image_path.suffix.lower() == path.suffix.lower()
-        return same and upright and image.mode in MODES and profile_of(image) is None
+        return same and upright and plain
     return False
 
 

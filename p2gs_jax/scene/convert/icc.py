@@ -111,7 +111,10 @@ class Profile:
 
 
 def profile_of(image: Image.Image) -> Profile | None:
-    """Return the colour space in the header of a photograph; None: sRGB, grey or unknown."""
+    """Return the colour space in the header of a photograph; None: sRGB, grey or unknown.
+
+    The file must be open, as it is before the first access to pixels or EXIF.
+    """
     coded = _cicp(image) if image.format == "PNG" else b""
     data = image.info.get("icc_profile")
     if data and not coded:
@@ -158,9 +161,9 @@ def _unless_srgb(
     return None if is_srgb else Profile(name, decode, matrix)
 
 
-def _cicp(image: Image.Image) -> bytes:
+def _cicp(image: Any) -> bytes:
     """Return the chunk of a PNG that Pillow skips, which states codes of H.273, or nothing."""
-    file: Any = image.fp
+    file = image.fp
     position = file.tell()
     file.seek(0)
     head = file.read(position).partition(b"IDAT")[0]
