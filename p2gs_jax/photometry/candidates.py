@@ -35,7 +35,7 @@ from p2gs_jax.photometry.models import (
     neighbours,
     parameter_count,
 )
-from p2gs_jax.photometry.observations import Labels
+from p2gs_jax.photometry.observations import Labels, grouped
 from p2gs_jax.photometry.response import BASES, Response, base_log
 
 # Least spread of exposures, or of vignetted light, from which a response is fitted, stops. For a
@@ -56,6 +56,9 @@ INVISIBLE_DIFFERENCE = 1.0
 MOST_MOVED, SMALLEST_ERROR_EV = 3.0, 0.0025
 # The predictive density is a mixture, so that outliers do not decide: share, deviation (log).
 OUTLIERS, OUTLIER_DEVIATION = 0.1, 1.2
+# Largest distance of a difference between two candidates from the median of its view, nat. An
+# observation that is an inlier for one of them only would count with up to 6 nat.
+LARGEST_DISTANCE = 1.0
 RANGES = 8  # number of ranges of brightness, equal in count, in which prediction errors are scaled
 SMALLEST_ERROR = 0.3  # lower bound of these scales, in units of the stated errors
 
@@ -67,7 +70,7 @@ class Candidate:
     choice: Choice  # form and kind of curve
     response: Response
     parameters: int  # number of free parameters, without gauges
-    density: float  # mean held-out log density, nat per observation
+    density: float  # mean held-out log density, nat per observation; differences are bounded
     deficit: float  # density of the best candidate minus this one, nat per observation
     deficit_error: float  # standard error of the deficit, over views or regions of images
     # RMS difference from the best's predictions in the view with the largest RMS, 8-bit levels.
@@ -252,11 +255,10 @@ class Search:
         for choice, fit in self.fits.items():
             if choice not in self._predicted:
                 self._predicted[choice] = _predict(self._problem, *fit, self._held)
-        # A solution may predict no observation at all.
-        density = {
-            k: -np.inf if np.isnan(p.densities).all() else float(np.nanmean(p.densities))
-            for k, p in self._predicted.items()
-        }
+        density = {k: _mean(p.densities) for k, p in self._predicted.items()}
+        first = max(density, key=density.__getitem__)
+        for k, p in self._predicted.items():
+            density[k] = density[first] + _mean(self._difference(p, self._predicted[first]))
         gammas = {k: MODELS[k.form.model].gamma == "view" for k in density}
         others = max((d for k, d in density.items() if not gammas[k]), default=-np.inf)
         if max(density.values()) < others + GAMMA_GAIN:
@@ -271,7 +273,7 @@ class Search:
         found = self._predicted[choice]
         best = self._predicted[max(density, key=density.__getitem__)]
         # Errors are correlated within a view and within a region of an image.
-        lower, labels = best.densities - found.densities, (self._views, self._regions)
+        lower, labels = self._difference(best, found), (self._views, self._regions)
         deficits, errors = zip(*(mean_deficit(lower, of) for of in labels), strict=True)
         difference = _largest_difference(best.errors - found.errors, self._views)
         fields = (self.fits[choice][1], self._parameters(choice), density[choice])
@@ -281,6 +283,18 @@ class Search:
             return candidate
         alike = (c for c in density if c.curve == choice.curve)
         return replace(candidate, moved=self._moved(choice, max(alike, key=density.__getitem__)))
+
+    def _difference(self, one: Predicted, other: Predicted) -> np.ndarray:
+        """Return the differences of log densities, bounded around the median of each view.
+
+        What a view's parameters change is common to the view; outliers differ alone.
+        """
+        found = one.densities - other.densities
+        for mine in grouped(self._views, int(self._views.max(initial=-1)) + 1):
+            known = mine[np.isfinite(found[mine])]
+            middle = np.median(found[known]) if known.size else 0.0
+            found[known] = found[known].clip(middle - LARGEST_DISTANCE, middle + LARGEST_DISTANCE)
+        return found
 
     def _moved(self, choice: Choice, best: Choice) -> float:
         """Return the RMS difference of exposures from the best's, in units of their errors."""
@@ -360,6 +374,11 @@ def _predict(
         np.where(count > 0, (density * known).sum(1) / np.maximum(count, 1), np.nan),
         np.where(known, error, np.nan),
     )
+
+
+def _mean(densities: np.ndarray) -> float:
+    """Return the mean of finite values; a solution that predicts nothing has -inf."""
+    return float(np.nanmean(densities)) if np.isfinite(densities).any() else -np.inf
 
 
 def _largest_difference(difference: Float[np.ndarray, "h 3"], views: Labels) -> float:

@@ -283,6 +283,14 @@ def test_the_simplest_model_that_is_not_clearly_worse_wins():
     assert choose([rich, better, middle]) is middle
 
 
+def test_outliers_do_not_hide_a_white_balance():
+    drive = make_drive(20, 1200)
+    stops = [[-0.085, -0.016, 0.101], [-0.077, -0.079, 0.156], [0.026, 0.083, -0.109]]
+    light = 2.0 ** np.array(stops)[drive.cameras]
+    s = select(observe(drive, light, curve="filmic", pivot=0.18, seed=30)).solution
+    assert (s.model, s.white_balance_level) == ("constant", "camera")
+
+
 def test_vignetting_that_nobody_sees_is_found_if_it_moves_exposures():
     lost = np.array([[0.05], [0.0], [0.02]]) * [1.0, 1.0, 1.0]
     drive = make_drive(16, 1500)
