@@ -17,7 +17,7 @@ from p2gs_jax.synth.sensor import READ_NOISE, SHOT_NOISE, encode
 from p2gs_jax.synth.settings import Curve
 
 Curves = Curve | np.ndarray
-Exposures = Literal["constant", "iso2", "iso4", "cameras"]
+Exposures = Literal["constant", "iso2", "iso4", "cameras", "auto"]
 YAWS = (0.0, -44.2, 44.8)  # degrees to the left
 CAMERA_NAMES = ("front", "right", "left")
 HALF_WIDTH, HALF_HEIGHT = 30.0, 21.0  # degrees of the field of view
@@ -93,14 +93,19 @@ def make_drive(frames: int, points: int, seed: int = 0) -> Drive:
 def make_exposures(drive: Drive, kind: Exposures, seed: int = 2) -> Float[np.ndarray, " v"]:
     """Return exposures > 0 of every view.
 
-    `iso2` and `iso4` draw ISO ~ N(8, std), rounded, at least 1, over 8; `cameras` have one each.
+    `iso2` and `iso4` draw ISO ~ N(8, std), rounded, at least 1, over 8; `cameras` have one each;
+    `auto` drifts slowly, as an automatic exposure does.
     """
     if kind == "constant":
         return np.ones(len(drive.cameras))
     if kind in ("iso2", "iso4"):
         draws = np.random.default_rng(seed).normal(8, float(kind[-1]), len(drive.cameras))
         return np.maximum(np.round(draws), 1) / 8
-    return np.array([1.0, 0.7, 1.4])[drive.cameras]
+    if kind == "cameras":
+        return np.array([1.0, 0.7, 1.4])[drive.cameras]
+    phase = 2.6 * np.pi * np.arange(drive.frames) / drive.frames
+    of_cameras = [0.8 * np.sin(phase + 2.1 * k) + v for k, v in enumerate((0.0, -0.3, 0.3))]
+    return 2.0 ** np.concatenate(of_cameras)
 
 
 def observe(

@@ -136,6 +136,7 @@ class Search:
         self._problem = replace(problem, usable=problem.usable & tied[:, None])
         self._views, self._regions = o.views[held], clusters_of(o, problem.layout.row)[held]
         self._predicted: dict[Choice, Predicted] = {}
+        self._differences: dict[tuple[Choice, Choice], np.ndarray] = {}
         self._errors: dict[Choice, np.ndarray] = {}  # of log exposures, for the best choices
         self._hopeless: set[Level | None] = set()
         self._fitted: dict[tuple[Form, Curve], Response | None] = {}
@@ -257,8 +258,7 @@ class Search:
                 self._predicted[choice] = _predict(self._problem, *fit, self._held)
         density = {k: _mean(p.densities) for k, p in self._predicted.items()}
         first = max(density, key=density.__getitem__)
-        for k, p in self._predicted.items():
-            density[k] = density[first] + _mean(self._difference(p, self._predicted[first]))
+        density = {k: density[first] + _mean(-self._difference(first, k)) for k in density}
         gammas = {k: MODELS[k.form.model].gamma == "view" for k in density}
         others = max((d for k, d in density.items() if not gammas[k]), default=-np.inf)
         if max(density.values()) < others + GAMMA_GAIN:
@@ -270,12 +270,12 @@ class Search:
         return parameter_count(choice.form, choice.curve.splines, *levels, self._scope.power)
 
     def _candidate(self, choice: Choice, density: dict[Choice, float]) -> Candidate:
-        found = self._predicted[choice]
-        best = self._predicted[max(density, key=density.__getitem__)]
+        best = max(density, key=density.__getitem__)
         # Errors are correlated within a view and within a region of an image.
-        lower, labels = self._difference(best, found), (self._views, self._regions)
+        lower, labels = self._difference(best, choice), (self._views, self._regions)
         deficits, errors = zip(*(mean_deficit(lower, of) for of in labels), strict=True)
-        difference = _largest_difference(best.errors - found.errors, self._views)
+        apart = self._predicted[best].errors - self._predicted[choice].errors
+        difference = _largest_difference(apart, self._views)
         fields = (self.fits[choice][1], self._parameters(choice), density[choice])
         candidate = Candidate(choice, *fields, deficits[0], max(errors), difference, 0.0)
         # Splines of different forms have different powers.
@@ -284,16 +284,19 @@ class Search:
         alike = (c for c in density if c.curve == choice.curve)
         return replace(candidate, moved=self._moved(choice, max(alike, key=density.__getitem__)))
 
-    def _difference(self, one: Predicted, other: Predicted) -> np.ndarray:
+    def _difference(self, one: Choice, other: Choice) -> np.ndarray:
         """Return the differences of log densities, bounded around the median of each view.
 
         What a view's parameters change is common to the view; outliers differ alone.
         """
-        found = one.densities - other.densities
+        if (one, other) in self._differences:
+            return self._differences[one, other]
+        found = self._predicted[one].densities - self._predicted[other].densities
         for mine in grouped(self._views, int(self._views.max(initial=-1)) + 1):
             known = mine[np.isfinite(found[mine])]
             middle = np.median(found[known]) if known.size else 0.0
             found[known] = found[known].clip(middle - LARGEST_DISTANCE, middle + LARGEST_DISTANCE)
+        self._differences[one, other] = found
         return found
 
     def _moved(self, choice: Choice, best: Choice) -> float:

@@ -228,6 +228,9 @@ def _check_model(model: Model) -> None:
             why = f"{image.name} has camera {image.camera_id}, which is not in "
             why += f"{model.file('cameras')}"
             raise broken(f"{model.file('images')}:", why, _FIX)
+    twice = model.point_ids[1:][np.diff(model.point_ids) == 0]
+    if twice.max(initial=-1) >= 0:  # the points of a PLY have no ids
+        raise broken(model.file("points3D"), f"lists point {twice.max()} more than once", _FIX)
     bad = int((~(np.abs(model.xyz) < files.HUGE).all(axis=1)).sum())
     if bad:
         why = f"{bad} of {len(model.xyz)} points are not finite"
@@ -435,6 +438,8 @@ def _text_cameras(path: Path) -> dict[int, CameraRecord]:
         with _parsing(path, number):
             camera_id, model, width, height, *params = line.split()
             values = tuple(map(float, params))
+            if int(camera_id) in cameras:
+                raise ValueError(f"camera {camera_id} is listed again")
             cameras[int(camera_id)] = CameraRecord(model, int(width), int(height), values)
             if _MODELS.get(model, (len(values),))[0] != len(values):
                 raise ValueError(f"{len(values)} parameters for the model {model}")

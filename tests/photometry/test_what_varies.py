@@ -233,14 +233,6 @@ def test_a_filmic_camera_gets_a_spline_unless_its_curve_is_known():
     assert "The tone curve is known (camera raw)" in s.reasons[0]
 
 
-@pytest.mark.slow
-def test_equal_exposures_stay_equal_where_corners_tell_the_curve():
-    drive = make_drive(20, 1200)
-    o = observe(drive, make_exposures(drive, "constant"), curve="filmic", corner_loss=LOST)
-    s = select(o).solution
-    assert (s.model, s.vignetting) == ("constant", "camera")
-
-
 @pytest.mark.parametrize(
     ("spread", "model"), [(0.05, "view_exposure"), (0.15, "view_exposure_gamma")]
 )

@@ -83,6 +83,8 @@ def test_text_models_and_names_with_blanks_are_read(tmp_path):
         ({"pose": "1 0 0 0 nan 0 0"}, "images.txt: the pose of im 0.png is not finite"),
         ({"points": "7 0.1 zwei 4 10 20 30 0.5 1 0\n"}, "points3D.txt is malformed in line 1"),
         ({"points": "7 nan 0 4 1 2 3 0.5 1 0\n"}, "points3D.txt: 1 of 1 points are not finite"),
+        ({"points": 2 * "7 0.1 0 4 1 2 3 0.5 1 0\n"}, "points3D.txt lists point 7 more than once"),
+        ({"cameras": 2 * "1 PINHOLE 40 30 50 50 20 15\n"}, "line 3: camera 1 is listed again"),
         ({"cameras": "1 OTHER 40 30 50 50 20 15\n"}, "cameras.txt uses the camera model OTHER"),
         ({"cameras": "1 EQUIRECTANGULAR 40 30 40 30\n"}, "model EQUIRECTANGULAR.*\n.*cut the pano"),
         ({"cameras": "1 PINHOLE 40 30 50 50 20\n"}, "cameras.txt is malformed in line 2"),
