@@ -233,11 +233,15 @@ def solved(
     """Solve the photometry of some views, and compare it with stated exposures.
 
     Reading began at `begin` (`time.monotonic`); `gauge` describes what fixes the scale if `cfg`
-    names no known exposures. Views without `signal` are not compared. UserError: there is one view.
+    names no known exposures. Views without `signal` are not compared. UserError: there is one view,
+    or no observation.
     """
     if len(views) < 2:
         why = f"there is only {views[0].name}; the exposures of photographs are compared."
         raise UserError(why, fix="add photographs of the same surfaces")
+    if not len(observations.points):
+        fix = "add photographs of the same surfaces; masks are black where pixels are to be ignored"
+        raise UserError("no point is visible in two photographs.", fix=fix)
     sampled = time.monotonic()
     reporter.stage("Photometric bundle adjustment")
     selection = calibrate_observations(observations, options)

@@ -254,6 +254,8 @@ def test_masks_that_hide_everything_are_refused(tmp_path, refused):
     assert "the masks hide every pixel of all" in text
     assert "invert them" in text
     assert not (tmp_path / "run" / "config.json").exists()
+    with pytest.raises(UserError, match="no point is visible in two photographs"):
+        p2gs_jax.calibrate(made, tmp_path / "calibrated")
 
 
 FIT = (
