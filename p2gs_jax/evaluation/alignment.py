@@ -49,11 +49,12 @@ def exposure_error(
 ) -> ExposureError:
     """Return the errors of exposures against the true ones, after gauges are removed.
 
-    ValueError: an exposure is not positive.
+    ValueError: an exposure is not a positive number, there is none, or their counts differ.
     """
     exposures, truth = np.asarray(exposures, np.float64), np.asarray(truth, np.float64)
-    if (exposures <= 0).any() or (truth <= 0).any():
-        raise ValueError("exposures must be positive")
+    both = np.stack([exposures, truth])  # raises ValueError unless their shapes agree
+    if not both.size or not (np.isfinite(both) & (both > 0)).all():
+        raise ValueError("exposures must be positive numbers")
     a, b = np.log2(exposures), np.log2(truth)
     a, b = a - a.mean(), b - b.mean()
     spread = a @ a > 1e-12 and b @ b > 1e-12

@@ -24,8 +24,12 @@ def test_exposure_error_ignores_scale_and_reports_power():
     one_off = e.copy()
     one_off[3] *= 2
     assert alignment.exposure_error(one_off, e)["ev_max"] == pytest.approx(0.95, abs=0.01)
-    with pytest.raises(ValueError, match="positive"):
-        alignment.exposure_error(np.array([1.0, 0.0]), e[:2])
+    for wrong in ([1.0, 0.0], [1.0, np.nan], [1.0, np.inf]):
+        with pytest.raises(ValueError, match="positive"):
+            alignment.exposure_error(np.array(wrong), e[:2])
+    for count in (0, 1):  # a single exposure would count for both
+        with pytest.raises(ValueError, match=r"positive|shape"):
+            alignment.exposure_error(e[:count], e[: 2 * count])
 
 
 def light(seed=0):
