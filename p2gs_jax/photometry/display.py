@@ -8,7 +8,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import jax
 import numpy as np
@@ -104,8 +104,10 @@ class DisplayTransform:
     def with_curve(self, curve: Curve) -> DisplayTransform:
         """Return the transform under another base curve, without the correction of the old curve.
 
-        Raises UserError: the curve is `spline` and the run has none.
+        Raises UserError: the curve is unknown, or it is `spline` and the run has none.
         """
+        if curve not in get_args(Curve):
+            raise UserError(f"{curve!r} is not a curve.", fix=f"use {', '.join(get_args(Curve))}")
         if curve == self.formation.curve:
             return self
         if curve == "spline" and self.formation.spline is None and not by_camera(self.formation):

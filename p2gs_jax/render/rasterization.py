@@ -71,7 +71,19 @@ def rasterization(
     """
     if render_mode not in MODES:
         raise ValueError(f"render_mode {render_mode!r} is not valid: choose {', '.join(MODES)}")
-    each = _for_each_camera(colors, means.shape[0], viewmats.shape[0], sh_degree)
+    count, cameras = len(means), len(viewmats)
+    for name, array, shape in (
+        ("means", means, (count, 3)),
+        ("quats", quats, (count, 4)),
+        ("scales", scales, (count, 3)),
+        ("opacities", opacities, (count,)),
+        ("viewmats", viewmats, (cameras, 4, 4)),
+        ("Ks", Ks, (cameras, 3, 3)),
+        ("backgrounds", backgrounds, (cameras, 3)),
+    ):
+        if array is not None and array.shape != shape:
+            raise ValueError(f"{name} have shape {array.shape}: {shape} is needed")
+    each = _for_each_camera(colors, count, cameras, sh_degree)
     cfg = cfg or RenderConfig(near=0.01, blur=0.3)
     cfg = dataclasses.replace(
         cfg,

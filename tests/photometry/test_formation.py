@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from p2gs_jax import with_fields
+from p2gs_jax import UserError, with_fields
 from p2gs_jax.config import CameraFormation, PhotometryConfig, RegularizerConfig
 from p2gs_jax.photometry.display import DisplayTransform, develop, undevelop
 from p2gs_jax.photometry.formation import (
@@ -202,6 +202,12 @@ def test_another_exposure_and_gamma_compile_nothing(caplog):
     for e, gamma in ((3.0, 1.7), (0.01, 2.9)):
         assert compiled(replace(transform, exposure=e, gamma=gamma)) == 0
     assert compiled(transform.with_curve("linear")) > 0  # else this test could not fail
+
+
+@pytest.mark.parametrize("curve", ["spline", "filmic"])
+def test_curves_that_a_run_lacks_are_refused(curve):
+    with pytest.raises(UserError, match=curve):
+        DisplayTransform(1.0, 2.2, SRGB).with_curve(curve)
 
 
 # ----------------------------------------- docs/photometry.md, 8: the edges of float32

@@ -109,6 +109,10 @@ def test_coefficients_above_the_degree_are_ignored_and_radiance_is_clipped_at_0(
     [
         ({}, {"render_mode": "RGBD"}, "choose RGB, D, ED"),
         ({"colors": jnp.zeros((300, 4))}, {}, "(300, 3) is needed"),
+        ({"scales": jnp.ones((299, 3))}, {}, "scales have shape (299, 3): (300, 3) is needed"),
+        ({"opacities": jnp.ones((300, 1))}, {}, "opacities have shape (300, 1): (300,) is needed"),
+        ({"Ks": jnp.eye(3)}, {}, "3, 3) is needed"),
+        ({}, {"backgrounds": jnp.zeros(3)}, "3) is needed"),
         ({"colors": jnp.zeros((300, 4, 3))}, {"sh_degree": 2}, "(300, 9, 3) is needed"),
     ],
 )
