@@ -394,6 +394,8 @@ def _lens(
 ) -> tuple[Float[np.ndarray, "3 3"], Distortion | None]:
     model = str(values.get("camera_model", "OPENCV")).upper()
     fisheye = _is_fisheye(values)
+    if (stated := values.get("is_fisheye")) not in (True, False, None):
+        raise broken(f"{path}:", f"is_fisheye of {name} is {stated!r}, not true or false", FIX)
     if model not in (*_PERSPECTIVE, _FISHEYE):
         known = ", ".join(sorted((*_PERSPECTIVE, _FISHEYE)))
         fix = CUT if model == "EQUIRECTANGULAR" else _UNDISTORT

@@ -100,6 +100,7 @@ POSE = "transform_matrix of a.png"
         ({"cx": float("nan")}, "cx of a.png is nan"),
         ({"k4": 0.1}, "k4"),
         ({"camera_model": "EQUIRECTANGULAR"}, "model EQUIRECTANGULAR.*\n.*pinhole photographs"),
+        ({"is_fisheye": "false"}, "is_fisheye of a.png is 'false', not true or false"),
         ({"camera_angle_y": 40.0}, "camera_angle_y of a.png is 40, not an .* pi[.]\n.*0.698132"),
         ({"is_fisheye": True, "fl_x": 0, "camera_angle_x": 2.0}, "it needs a positive fl_x[.]\n"),
         ('{\n "a": 5,\n "frames": [,]\n}', "is not valid JSON.* line 3"),
