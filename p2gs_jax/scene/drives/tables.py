@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float32, Float64, Int64
 
-from p2gs_jax.core.text import parse_json
+from p2gs_jax.core.text import first_few, parse_json
 from p2gs_jax.errors import UserError, broken
 
 Row = dict[str, Any]
@@ -37,8 +37,6 @@ _IN_TABLES = re.compile(
     r"|numpy\.(ndarray|dtype|_?core\.multiarray\._reconstruct|_?core\.numeric\._frombuffer)"
     r"|(builtins|__builtin__)\.slice"
 )
-# A message lists at most this many drives.
-LISTED = 5
 # The largest unpacked table, 256 MiB; a sweep of PandaSet has 10 MB.
 _MOST_BYTES = 2**28
 
@@ -77,8 +75,7 @@ def chosen_drive(wanted: str | None, there: Sequence[str], root: Path) -> str:
     fits = [name for name in fits if name == wanted] or fits
     if len(fits) == 1:
         return fits[0]
-    listed = sorted(fits or there)
-    names = ", ".join(listed[:LISTED]) + (", ..." if len(listed) > LISTED else "")
+    names = first_few(sorted(fits or there))
     if wanted is None:
         message = f"{root} holds {len(there)} drives: {names}"
     elif fits:
