@@ -27,8 +27,8 @@ says how rows are made and which systems were not run. The machine is that of
 Splats are blurred by 0.05 pixels^2 unless the row names another blur. Until commit 057bc06
 (2026-11-25) the default was the blur of 3DGS, 0.3 pixels^2. Rows of clean lego at 800 pixels are
 older than commit 05f3698 (2026-11-26), except three; until then long fits slowed the learning of
-colours as well ([length](results/2026-11-25-length.md)). These three are after 7,000 steps: `robust`
-and `3dgs` with the blur of 3DGS gained 0.12 and 0.17 dB when they were repeated, `3dgs` 0.05 dB.
+colours as well ([length](results/2026-11-25-length.md)). These three are after 7,000 steps. When
+they were repeated, `robust` and `3dgs` with the blur of 3DGS gained 0.12 and 0.17 dB, `3dgs` 0.05.
 """
 AT_SIZE = HERE.parent / "at_size.json"
 
