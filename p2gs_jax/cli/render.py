@@ -87,7 +87,7 @@ class Render:
         from p2gs_jax.cli.frames import panoramas_of, shots_of
         from p2gs_jax.core.progress import PlainConsole, TerminalReporter
         from p2gs_jax.formats.frames import open_frames, remove_frame
-        from p2gs_jax.paths.files import near_scene, read_cameras, write_cameras
+        from p2gs_jax.paths.files import CAMERAS, near_scene, read_cameras, write_cameras
 
         begin = time.monotonic()
         for refuse in (_check_picture, _check_path, _check_file):  # before anything is read
@@ -97,7 +97,7 @@ class Render:
         cameras = None if cameras is None else near_scene(cameras, fitted.scene.origin)
         out = self.out or fitted.folder / "renders" / _default_name(self, fitted.scene)
         _check_place(out, self.overwrite)
-        list_of_cameras = out / "cameras.json"
+        list_of_cameras = out / CAMERAS
         apart = list_of_cameras.resolve() != Path(self.trajectory).resolve()
         why = f"--trajectory names {list_of_cameras}, which would be replaced"
         check(apart, why, fix="choose another place with --out")

@@ -22,6 +22,8 @@ FIELDS = ("name", "viewmat", "K", "width", "height", "exposure_ev", "gamma", "ti
 # Smallest and largest values of optional fields; exposures in stops, times in seconds.
 LIMITS = {"exposure_ev": (-MOST_STOPS, MOST_STOPS), "gamma": (1e-3, 1e3)}
 LIMITS["time"] = (-math.inf, math.inf)
+CAMERAS = "cameras.json"  # file beside rendered pictures
+LONGEST_NAME = 240  # bytes, without suffix
 _FIX = "correct the file; docs/rendering.md has the format"
 
 
@@ -48,8 +50,9 @@ def read_cameras(path: Path) -> list[Shot]:
             if not isinstance(values, dict):
                 raise ValueError("is not an object with fields")
             shot = _entry(values, index)
-        except ValueError as error:
-            raise UserError(f"{path}: camera {index} {error}.", fix=_FIX) from None
+        except (ValueError, OverflowError) as error:
+            why = error if isinstance(error, ValueError) else "has a number that is too large"
+            raise UserError(f"{path}: camera {index} {why}.", fix=_FIX) from None
         if shot.name in shots:
             first = list(shots).index(shot.name)
             why = f"{path}: cameras {first} and {index} have the same name {shot.name!r}."
@@ -112,4 +115,9 @@ def _name(values: dict, index: int) -> str:
     parts = PurePosixPath(name).parts if isinstance(name, str) else ()
     if not parts or ".." in parts or PurePosixPath(name).is_absolute() or {"\\", "\0"} & {*name}:
         raise ValueError(f"has the name {name!r}, which is not a file within the output folder")
+    encoded = [part.encode(errors="ignore") for part in parts]  # lone surrogates have no bytes
+    if b"/".join(encoded).decode() != "/".join(parts) or max(map(len, encoded)) > LONGEST_NAME:
+        raise ValueError(f"has the name {name!r}, which is not a valid file name")
+    if parts[0] == CAMERAS:
+        raise ValueError(f"has the name {name!r}, but {CAMERAS} lists the cameras of a render")
     return PurePosixPath(name).as_posix()

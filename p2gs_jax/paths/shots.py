@@ -127,7 +127,7 @@ def as_matrix(values: ArrayLike, name: str, size: int) -> Float[np.ndarray, "n n
     """Return a finite square matrix from rows or a flat list; other values raise a ValueError."""
     try:
         out = np.array(values, np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         out = np.zeros(0)
     if out.shape == (size * size,):
         out = out.reshape(size, size)

@@ -9,12 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 from jaxtyping import Float
 
 from p2gs_jax.core.numerics import LN2
+from p2gs_jax.errors import UserError
 from p2gs_jax.photometry.formation import squared_radii
 
 WORDS: dict[str, str] = {  # the meters, and their names in text
@@ -110,6 +111,9 @@ class Metering:
         return self._log_exposure(readings, of) / LN2
 
     def _log_exposure(self, readings: Readings, of: ExposureOf) -> float:
+        if of not in get_args(ExposureOf):
+            why = f"{of!r} is not a rule of metering."
+            raise UserError(why, fix=f"use {', '.join(get_args(ExposureOf))}")
         grey, white = np.log(MID_GREY), np.log(self.white)
         if of == "auto":
             found = self.rule.log_exposure(readings)

@@ -187,6 +187,7 @@ class Run:
         The exposure of a held-out view is that fitted to its photograph; its other parameters are
         the usual ones of its camera.
         """
+        index = range(len(self.scene.views))[index]  # negative ones count from the end
         if index in self.scene.train_indices:
             row = self.scene.train_indices.index(index)
             trained = display.display_of_view(self.params, row, self.cfg.photometry)

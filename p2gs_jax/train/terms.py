@@ -22,6 +22,7 @@ from jax import lax
 from jaxtyping import Float, Int
 
 from p2gs_jax.config import FitConfig, LossConfig
+from p2gs_jax.errors import UserError
 from p2gs_jax.evaluation.ssim import one_less_ssim
 from p2gs_jax.photometry.appearance import Correction, Corrections, regularisation
 from p2gs_jax.photometry.luminance import ENTRIES, Curves, cumulative, enhanced, pseudo_curve
@@ -110,6 +111,7 @@ def loss_terms(
     """Return the terms of a configuration by name; a weight of None leaves a term out.
 
     Terms in `changed` are added or replace the term of the same name; None removes a term.
+    UserError: there is no term to remove.
     """
     loss, photometry, kind = cfg.loss, cfg.photometry, cfg.photometry.appearance
     relative, priors = loss.relative_exposure.weight, loss.regularizers
@@ -129,6 +131,10 @@ def loss_terms(
     if kind is not None and priors.appearance is not None:
         found.append(Term("appearance", priors.appearance, (kind,)))
     terms: dict[str, LossTerm | None] = {term.name: term for term in found}
+    for name in (name for name, term in (changed or {}).items() if term is None):
+        if name not in terms:
+            why = f"there is no loss term {name!r} to remove."
+            raise UserError(why, fix=f"name one of these: {', '.join(terms)}")
     terms |= changed or {}
     return {name: term for name, term in terms.items() if term is not None}
 

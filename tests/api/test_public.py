@@ -48,7 +48,8 @@ def test_a_new_camera_with_the_parameters_of_a_view_sees_the_same(finished_run):
     run = p2gs_jax.load_run(finished_run)
     view = run.scene.views[2]
     made = p2gs_jax.make_camera(view.K.tolist(), view.viewmat, view.width, view.height)
-    of_view = run.camera(2)
+    of_view, last = run.camera(2), len(run.scene.views) - 1
+    assert run.own_display(-1).exposure == run.own_display(last).exposure
     np.testing.assert_allclose(made.viewmat, of_view.viewmat, atol=1e-6)
     np.testing.assert_allclose(made.K, of_view.K)
     assert (made.width, made.height) == (of_view.width, of_view.height)

@@ -100,6 +100,8 @@ def test_metering_is_read_back_from_its_file(tmp_path):
     assert back.rule.left_out_ev == metering.rule.left_out_ev
     for rule in ("auto", "log_average"):
         assert back.typical_exposure(rule) == pytest.approx(metering.typical_exposure(rule), 1e-12)
+    with pytest.raises(UserError, match="'spot' is not a rule"):
+        back.typical_exposure("spot")
     path.write_text("{}")
     with pytest.raises(UserError, match=r"metering\.json cannot be read"):
         read_metering(path)

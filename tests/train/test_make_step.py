@@ -10,7 +10,7 @@ import pytest
 from noise_views import DEGREE, EXTENT, config, start, view
 
 import p2gs_jax
-from p2gs_jax import DivergenceError, FitConfig, loss_terms
+from p2gs_jax import DivergenceError, FitConfig, UserError, loss_terms
 from p2gs_jax.render.visible import splat
 from p2gs_jax.train.image_gradient import image_loss
 
@@ -92,6 +92,9 @@ def test_without_user_terms_the_terms_are_those_of_the_configuration():
     names = {"l1", "dssim", "log_exposure_mean", "gamma_mean_variance"}
     assert set(loss_terms(FitConfig())) == names
     assert loss_terms(FitConfig()) == loss_terms(FitConfig())  # so that fits share programs
+    assert set(loss_terms(FitConfig(), {"dssim": None})) == names - {"dssim"}
+    with pytest.raises(UserError, match="'d_ssim' to remove"):
+        loss_terms(FitConfig(), {"d_ssim": None})
 
 
 def test_a_user_formation_replaces_the_tone_curve_and_is_learned(made):

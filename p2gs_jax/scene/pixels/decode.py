@@ -38,6 +38,7 @@ _SENSOR_WHITES, _CLIPPED = (1023, 4095, 16383), 1e-4
 _EXTRA_SAMPLES, _ASSOCIATED = 338, (1,)
 # The tags for the order of channels, and for how a photograph is shown: as stored (1), or turned.
 _PLANES, _SEPARATE, _ORIENTATION = 284, 2, 274
+_PHOTOMETRIC, _LAB = 262, (8, 9, 10)  # CIELab, ICCLab, ITULab
 # The header of a PGM or PPM: its kind, width, height and largest value.
 _PNM = re.compile(rb"P([2356])" + rb"(?:\s|#.*\n)+(\d+)" * 3)
 
@@ -265,12 +266,16 @@ def _require_full_range(path: Path, raw: UInt[np.ndarray, "..."]) -> None:
 
 
 def _require_plain(path: Path, raw: UInt[np.ndarray, "..."]) -> None:
-    """Raise UserError for a TIFF that OpenCV turns, though poses belong to the stored pixels, or of
-    separate planes, of which OpenCV repeats the first one if they have 16 bits."""
-    planes, orientation = None, 1
+    """Raise UserError for a TIFF that OpenCV turns, though poses belong to the stored pixels, of
+    L*a*b*, which it reads as colours, or of separate planes, of which it repeats the first one if
+    they have 16 bits."""
+    planes, orientation, space = None, 1, None
     with contextlib.suppress(OSError), Image.open(path) as image:
         tags = getattr(image, "tag_v2", {})
         planes, orientation = tags.get(_PLANES), tags.get(_ORIENTATION, 1)
+        space = tags.get(_PHOTOMETRIC)
+    if space in _LAB:
+        raise broken(path, "is a TIFF of L*a*b* values, which are not read", "export it as sRGB")
     if planes == _SEPARATE and raw.dtype == np.uint16 and raw.ndim == 3:
         why = "is a TIFF of 16 bits with separate planes, which are not read"
         raise broken(path, why, "export it with interleaved channels, or as PNG")

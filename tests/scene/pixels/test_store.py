@@ -85,6 +85,12 @@ def test_a_tiff_that_opencv_turns_is_refused(tmp_path, turned):
         decode.stored(make_view(tmp_path / "a.tif", size=(8, 4)))
 
 
+def test_a_tiff_of_lab_values_is_refused(tmp_path):
+    Image.new("LAB", (8, 4)).save(tmp_path / "a.tif")
+    with refused(r"a.tif is a TIFF of L\*a\*b\* values"):
+        decode.stored(make_view(tmp_path / "a.tif", size=(8, 4)))
+
+
 @pytest.mark.parametrize(
     ("name", "mode"), [("a.png", "L"), ("a.png", "I;16"), ("a.png", "1"), ("a.tif", "LA")]
 )
