@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 
@@ -88,11 +88,24 @@ def _3dgs(folder: Path, saved: PhotometryFile, views: Sequence[View]) -> str:
 def _nerfstudio(folder: Path, saved: PhotometryFile, views: Sequence[View], *, base: Path) -> str:
     """Write the photometry of every photograph as fields of a frame of `transforms.json`."""
     path, fields = folder / "frames.json", ("exposure_ev", "gamma", "white_balance")
-    rows = {row["image"]: row for row in saved["views"]}
+    rows, paths = {row["image"]: row for row in saved["views"]}, _photographs(views, base)
     frames = [
-        {"file_path": relative_path(view.image_path, base)}
-        | {name: rows[view.name][name] for name in fields}
+        {"file_path": paths[view.name]} | {name: rows[view.name][name] for name in fields}
         for view in views
     ]
     write_json(path, {"frames": frames})
     return f"{path}: fields of the frames of nerfstudio's transforms.json."
+
+
+def _photographs(views: Sequence[View], base: Path) -> dict[str, str]:
+    """Return the path of each photograph from the scene's folder, by name.
+
+    Views of converted photographs show files of a cache, which are named differently.
+    """
+    paths = {view.name: relative_path(view.image_path, base) for view in views}
+    lost = {view.name for view in views if view.image_path.name != PurePosixPath(view.name).name}
+    below = (path.relative_to(base).parts for path in (base.rglob("*.*") if lost else ()))
+    for parts in sorted(below, key=len, reverse=True):
+        tails = ("/".join(parts[k:]) for k in range(len(parts)))
+        paths |= {tail: "/".join(parts) for tail in tails if tail in lost}
+    return paths

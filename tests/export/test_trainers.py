@@ -1,6 +1,7 @@
 """Values for other trainers, applied as by the code of these trainers."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -67,4 +68,12 @@ def test_frames_of_nerfstudio_have_their_exposures(tmp_path, monkeypatch):
     assert "frames.json" in write_for(["nerfstudio"], tmp_path, VIEWS, Path("scene"))[0]
     first, _ = json.loads((tmp_path / "frames.json").read_text())["frames"]
     assert first["file_path"] == "images/a.png"
+    # Converted photographs lie in a cache.
+    for name in EXPOSURES:
+        Path("scene/front", name).parent.mkdir(exist_ok=True)
+        Path("scene/front", name).touch()
+    views = [replace(v, image_path=Path(f"scene/out/cache/{v.name}.png")) for v in VIEWS]
+    write_for(["nerfstudio"], tmp_path, views, Path("scene"))
+    frames = json.loads((tmp_path / "frames.json").read_text())["frames"]
+    assert [frame["file_path"] for frame in frames] == ["front/a.png", "front/b.png"]
     assert (first["gamma"], first["white_balance"]) == (GAMMA, list(BALANCE))
