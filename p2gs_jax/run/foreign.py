@@ -28,6 +28,7 @@ from p2gs_jax.render.capacity import RenderView, make_renderer
 from p2gs_jax.run import photometry_files, read
 from p2gs_jax.run.scene_file import folder_of
 from p2gs_jax.scene import find_scene, with_masks_and_split
+from p2gs_jax.scene.convert.convert import converted_views
 from p2gs_jax.scene.exposures import row_finder
 from p2gs_jax.scene.masks import with_alpha
 from p2gs_jax.scene.pixels.store import camera_of
@@ -127,7 +128,8 @@ def foreign_run(splats: str | Path, photometry: str | Path, scene: str | Path) -
     if not isinstance(found, Scene):
         fix = f"name the scene that the other program read, {DEVELOPED.parent} in {folder}"
         raise broken(scene, "has no COLMAP model and no transforms.json", fix)
-    found = with_alpha(with_masks_and_split(found, data), data)
+    found = with_masks_and_split(found, data)
+    found = with_alpha(converted_views(found, folder / "cache", lambda text: None), data)
     if folder_of(found.root).resolve() == (folder / DEVELOPED).parent.resolve():
         saved = _with_developed_names(saved, folder, found)
     found, notes = _with_known(found, saved, path)

@@ -7,10 +7,10 @@ import cv2
 import numpy as np
 import pytest
 from splats import gaussians_of
-from tiny_scene import make_scene, write_solved
+from tiny_scene import make_scene, rewrite, write_solved
 
 from p2gs_jax.core.numerics import srgb_encode
-from p2gs_jax.formats.exr import read_exr
+from p2gs_jax.formats.exr import read_exr, write_exr
 from p2gs_jax.formats.ply import read_ply, write_ply, write_radiance
 from p2gs_jax.render.harmonics import C0
 from p2gs_jax.run.foreign import foreign_run
@@ -94,6 +94,16 @@ def test_names_of_developed_photographs_mean_their_originals(trained, tmp_path):
     run = foreign_run(trained / "splat.ply", tmp_path / "cal", developed)
     assert [run.own_display(row).exposure for row in (0, 1)] == pytest.approx(EXPOSURES)
     assert run.scene.test_indices == (2,)
+
+
+def test_developed_exr_are_read(trained, tmp_path):
+    def write(path, image):
+        write_exr(path, np.asarray(image, np.float32) / 255)
+
+    scene = rewrite(shutil.copytree(trained / "scene", tmp_path / "scene"), ".exr", write)
+    write_calibration(tmp_path / "cal", ("0.exr", "1.exr", "2.exr"), "1")
+    run = foreign_run(trained / "splat.ply", tmp_path / "cal", scene)
+    assert run.photograph(0).shape == (HEIGHT, WIDTH, 3)
 
 
 def test_without_developed_photographs_colours_show_the_mean_exposure(trained, tmp_path):
