@@ -85,19 +85,21 @@ class Render:
         import time
 
         from p2gs_jax.cli.frames import panoramas_of, shots_of
+        from p2gs_jax.core.atomic import write_json
         from p2gs_jax.core.progress import PlainConsole, TerminalReporter
         from p2gs_jax.formats.frames import open_frames, remove_frame
-        from p2gs_jax.paths.files import CAMERAS, near_scene, read_cameras, write_cameras
+        from p2gs_jax.paths import files
 
         begin = time.monotonic()
         for refuse in (_check_picture, _check_path, _check_file):  # before anything is read
             refuse(self)
-        cameras = read_cameras(Path(self.trajectory)) if self.trajectory not in PATHS else None
+        given = self.trajectory not in PATHS
+        cameras = files.read_cameras(Path(self.trajectory)) if given else None
         fitted = _load(self)
-        cameras = None if cameras is None else near_scene(cameras, fitted.scene.origin)
+        cameras = None if cameras is None else files.near_scene(cameras, fitted.scene.origin)
         out = self.out or fitted.folder / "renders" / _default_name(self, fitted.scene)
         _check_place(out, self.overwrite)
-        list_of_cameras = out / CAMERAS
+        list_of_cameras = out / files.CAMERAS
         apart = list_of_cameras.resolve() != Path(self.trajectory).resolve()
         why = f"--trajectory names {list_of_cameras}, which would be replaced"
         check(apart, why, fix="choose another place with --out")
@@ -110,17 +112,21 @@ class Render:
             for note in (*fitted.notes, *job.notes):
                 reporter.message(note)
             # An earlier render may have had more frames.
-            if list_of_cameras.is_file():
-                for shot in read_cameras(list_of_cameras):
-                    remove_frame(out, shot.name)
-                list_of_cameras.unlink()
+            for name in files.written_names(out):
+                remove_frame(out, name)
+            for record in (list_of_cameras, out / files.PANORAMAS):
+                record.unlink(missing_ok=True)
+            names = []
             reporter.stage("Rendering", 0, job.count)
             with open_frames(out, job.size, self.fps or FPS) as write:
                 for done, frame in enumerate(job.frames):
                     write(frame)
+                    names.append(frame.name)
                     reporter.stage("Rendering", done + 1, job.count)
             if job.shots and not is_video(out):
-                write_cameras(list_of_cameras, job.shots)
+                files.write_cameras(list_of_cameras, job.shots)
+            elif not is_video(out):
+                write_json(out / files.PANORAMAS, names)
         count, seconds = count_of(job.count, "frame"), time.monotonic() - begin
         PlainConsole().print(f"{count} in {seconds:.1f} s: {out}", soft_wrap=True)
         return 0

@@ -10,7 +10,7 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from p2gs_jax.core.atomic import write_json
+from p2gs_jax.core.atomic import readable, write_json
 from p2gs_jax.core.text import parse_json
 from p2gs_jax.errors import UserError
 from p2gs_jax.formats.frames import SUFFIXES
@@ -22,7 +22,8 @@ FIELDS = ("name", "viewmat", "K", "width", "height", "exposure_ev", "gamma", "ti
 # Smallest and largest values of optional fields; exposures in stops, times in seconds.
 LIMITS = {"exposure_ev": (-MOST_STOPS, MOST_STOPS), "gamma": (1e-3, 1e3)}
 LIMITS["time"] = (-math.inf, math.inf)
-CAMERAS = "cameras.json"  # file beside rendered pictures
+# Files beside rendered pictures: their cameras, and the names of panoramas.
+CAMERAS, PANORAMAS = "cameras.json", "panoramas.json"
 LONGEST_NAME = 240  # bytes, without suffix
 _FIX = "correct the file; docs/rendering.md has the format"
 
@@ -66,6 +67,16 @@ def read_cameras(path: Path) -> list[Shot]:
             why = f"{path}: camera {index} has the name {name!r}, whose folder is a file of the "
             raise UserError(f"{why}camera {inside!r}.", fix=_FIX)
     return list(shots.values())
+
+
+def written_names(folder: Path) -> list[str]:
+    """Return the names of the pictures of an earlier render in a folder."""
+    cameras, wide = folder / CAMERAS, folder / PANORAMAS
+    names = [shot.name for shot in read_cameras(cameras)] if cameras.is_file() else []
+    if wide.is_file():
+        with readable(wide, "remove the file, and pictures of earlier panoramas"):
+            names += [_name({"name": name}, 0) for name in parse_json(wide.read_text())]
+    return names
 
 
 def near_scene(shots: Sequence[Shot], origin: Sequence[float]) -> list[Shot]:
@@ -118,6 +129,6 @@ def _name(values: dict, index: int) -> str:
     encoded = [part.encode(errors="ignore") for part in parts]  # lone surrogates have no bytes
     if b"/".join(encoded).decode() != "/".join(parts) or max(map(len, encoded)) > LONGEST_NAME:
         raise ValueError(f"has the name {name!r}, which is not a valid file name")
-    if parts[0] == CAMERAS:
-        raise ValueError(f"has the name {name!r}, but {CAMERAS} lists the cameras of a render")
+    if parts[0] in (CAMERAS, PANORAMAS):
+        raise ValueError(f"has the name {name!r}, but {parts[0]} lists the pictures of a render")
     return PurePosixPath(name).as_posix()

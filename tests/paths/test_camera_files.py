@@ -53,7 +53,7 @@ WRONG = {
     "a number that is too large": ("time", 10**400),
     "K that is not": ("K", [[10**400, 0, 32], [0, 50, 24], [0, 0, 1]]),
     "not a valid file name": ("name", "\ud800", "a" * 300),
-    "lists the cameras": ("name", "cameras.json/a"),
+    "lists the pictures": ("name", "cameras.json/a"),
     "height": ("height", ..., "48", 1e300),
     "gamma": ("gamma", 0),
     "exposure_ev": ("exposure_ev", "bright", 5000),

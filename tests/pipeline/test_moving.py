@@ -135,6 +135,9 @@ def test_the_command_renders_what_moves(run, tmp_path, succeeded, refused):
     assert len({contents[name][0] for name in ("all", "without", "only")}) == 3
     assert contents["again"] == contents["drive"]
     assert contents["wide"][0] not in (contents["bare"][0], contents["part"][0])
+    succeeded(*base[:2], *options["wide"], "--out", tmp_path / "views", "--overwrite")
+    left = [p.read_bytes() for p in sorted((tmp_path / "views").rglob("*.exr"))]
+    assert left == contents["wide"] != contents["views"]
     shots = json.loads((tmp_path / "drive" / "cameras.json").read_text())
     assert [s["time"] for s in shots] == sorted(s["time"] for s in shots)
     assert shots[0]["time"] == 0.0
