@@ -87,7 +87,7 @@ class Render:
         from p2gs_jax.cli.frames import panoramas_of, shots_of
         from p2gs_jax.core.atomic import write_json
         from p2gs_jax.core.progress import PlainConsole, TerminalReporter
-        from p2gs_jax.formats.frames import open_frames, remove_frame
+        from p2gs_jax.formats.frames import open_frames
         from p2gs_jax.paths import files
 
         begin = time.monotonic()
@@ -112,10 +112,7 @@ class Render:
             for note in (*fitted.notes, *job.notes):
                 reporter.message(note)
             # An earlier render may have had more frames.
-            for name in files.written_names(out):
-                remove_frame(out, name)
-            for record in (list_of_cameras, out / files.PANORAMAS):
-                record.unlink(missing_ok=True)
+            files.remove_rendered(out)
             names = []
             reporter.stage("Rendering", 0, job.count)
             with open_frames(out, job.size, self.fps or FPS) as write:

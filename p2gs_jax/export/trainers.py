@@ -105,7 +105,8 @@ def _photographs(views: Sequence[View], base: Path) -> dict[str, str]:
     paths = {view.name: relative_path(view.image_path, base) for view in views}
     lost = {view.name for view in views if view.image_path.name != PurePosixPath(view.name).name}
     below = (path.relative_to(base).parts for path in (base.rglob("*.*") if lost else ()))
-    for parts in sorted(below, key=len, reverse=True):
+    # The shallowest file counts, and `images` before smaller copies in `images_2`.
+    for parts in sorted(below, key=lambda parts: (len(parts), parts), reverse=True):
         tails = ("/".join(parts[k:]) for k in range(len(parts)))
         paths |= {tail: "/".join(parts) for tail in tails if tail in lost}
     return paths

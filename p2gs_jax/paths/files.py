@@ -13,7 +13,7 @@ import numpy as np
 from p2gs_jax.core.atomic import readable, write_json
 from p2gs_jax.core.text import parse_json
 from p2gs_jax.errors import UserError
-from p2gs_jax.formats.frames import SUFFIXES
+from p2gs_jax.formats.frames import SUFFIXES, remove_frame
 from p2gs_jax.options import MOST_STOPS
 from p2gs_jax.paths.shots import LARGEST, Shot, checked_lens, checked_pose
 from p2gs_jax.scene.rigid import camera_centers, pose_of
@@ -69,14 +69,18 @@ def read_cameras(path: Path) -> list[Shot]:
     return list(shots.values())
 
 
-def written_names(folder: Path) -> list[str]:
-    """Return the names of the pictures of an earlier render in a folder."""
+def remove_rendered(folder: Path) -> None:
+    """Remove the pictures of an earlier render from a folder, with the list of these, if any."""
     cameras, wide = folder / CAMERAS, folder / PANORAMAS
     names = [shot.name for shot in read_cameras(cameras)] if cameras.is_file() else []
     if wide.is_file():
         with readable(wide, "remove the file, and pictures of earlier panoramas"):
             names += [_name({"name": name}, 0) for name in parse_json(wide.read_text())]
-    return names
+    for name in names:
+        remove_frame(folder, name)
+    for record in (cameras, wide):
+        if record.is_file():  # `folder` may be a video
+            record.unlink()
 
 
 def near_scene(shots: Sequence[Shot], origin: Sequence[float]) -> list[Shot]:

@@ -348,7 +348,12 @@ def read_model(folder: Path) -> Model:
         ids = np.full(len(xyz), -1)
     else:
         ids, xyz, rgb = np.zeros(0, int), np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
-    return Model(folder, ext, read_cameras(cameras), tuple(read_images(images)), ids, xyz, rgb)
+    by_id: dict[int, CameraRecord] = {}
+    for camera_id, record in read_cameras(cameras):
+        if camera_id in by_id:
+            raise broken(cameras, f"lists camera {camera_id} more than once", _FIX)
+        by_id[camera_id] = record
+    return Model(folder, ext, by_id, tuple(read_images(images)), ids, xyz, rgb)
 
 
 class _Cursor:
@@ -390,16 +395,14 @@ class _Cursor:
         return broken(self.path, why, _FIX_FILES)
 
 
-def _binary_cameras(path: Path) -> dict[int, CameraRecord]:
+def _binary_cameras(path: Path) -> Iterator[tuple[int, CameraRecord]]:
     cursor = _Cursor(path)
-    cameras = {}
     for _ in range(cursor.count(24)):
         camera_id, model_id, width, height = cursor.unpack("<iiQQ")
         if not 0 <= model_id < len(_MODELS):
             raise _unsupported(path, f"number {model_id}")
         model, (n, _) = list(_MODELS.items())[model_id]
-        cameras[camera_id] = CameraRecord(model, width, height, cursor.unpack(f"<{n}d"))
-    return cameras
+        yield camera_id, CameraRecord(model, width, height, cursor.unpack(f"<{n}d"))
 
 
 def _binary_images(path: Path) -> Iterator[ImageRecord]:
@@ -432,18 +435,15 @@ def _parsing(path: Path, line: int) -> Iterator[None]:
         raise broken(path, f"is malformed in line {line}: {error}", _FIX_FILES) from None
 
 
-def _text_cameras(path: Path) -> dict[int, CameraRecord]:
-    cameras = {}
+def _text_cameras(path: Path) -> Iterator[tuple[int, CameraRecord]]:
     for number, line in _text_lines(path):
         with _parsing(path, number):
             camera_id, model, width, height, *params = line.split()
             values = tuple(map(float, params))
-            if int(camera_id) in cameras:
-                raise ValueError(f"camera {camera_id} is listed again")
-            cameras[int(camera_id)] = CameraRecord(model, int(width), int(height), values)
+            record = int(camera_id), CameraRecord(model, int(width), int(height), values)
             if _MODELS.get(model, (len(values),))[0] != len(values):
                 raise ValueError(f"{len(values)} parameters for the model {model}")
-    return cameras
+        yield record
 
 
 def _text_images(path: Path) -> Iterator[ImageRecord]:

@@ -67,6 +67,7 @@ def test_a_drive_becomes_a_video_that_is_not_replaced(refused, rendered, finishe
     argv = ("--trajectory=drive", "--frames", 7, "--fps", 12, "--width", 64, "--out", out)
     rendered(*argv)
     assert [p.name for p in out.parent.iterdir()] == ["drive.mp4"]
+    assert "frames in" in rendered(*argv, "--overwrite")
     frames = video(out)
     assert len(frames) == 7
     assert frames[0].shape == (56, 64, 3)  # 57.1 pixels high, cut to an even number

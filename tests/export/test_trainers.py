@@ -69,9 +69,10 @@ def test_frames_of_nerfstudio_have_their_exposures(tmp_path, monkeypatch):
     first, _ = json.loads((tmp_path / "frames.json").read_text())["frames"]
     assert first["file_path"] == "images/a.png"
     # Converted photographs lie in a cache.
-    for name in EXPOSURES:
-        Path("scene/front", name).parent.mkdir(exist_ok=True)
-        Path("scene/front", name).touch()
+    for folder in ("scene/front_2", "scene/front", "scene/front_8"):
+        Path(folder).mkdir()
+        for name in EXPOSURES:
+            Path(folder, name).touch()
     views = [replace(v, image_path=Path(f"scene/out/cache/{v.name}.png")) for v in VIEWS]
     write_for(["nerfstudio"], tmp_path, views, Path("scene"))
     frames = json.loads((tmp_path / "frames.json").read_text())["frames"]

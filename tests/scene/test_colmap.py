@@ -1,6 +1,7 @@
 """COLMAP models, binary and text, agree with pycolmap, and broken ones are refused."""
 
 import os
+import struct
 
 import numpy as np
 import pycolmap
@@ -84,7 +85,10 @@ def test_text_models_and_names_with_blanks_are_read(tmp_path):
         ({"points": "7 0.1 zwei 4 10 20 30 0.5 1 0\n"}, "points3D.txt is malformed in line 1"),
         ({"points": "7 nan 0 4 1 2 3 0.5 1 0\n"}, "points3D.txt: 1 of 1 points are not finite"),
         ({"points": 2 * "7 0.1 0 4 1 2 3 0.5 1 0\n"}, "points3D.txt lists point 7 more than once"),
-        ({"cameras": 2 * "1 PINHOLE 40 30 50 50 20 15\n"}, "line 3: camera 1 is listed again"),
+        (
+            {"cameras": 2 * "1 PINHOLE 40 30 50 50 20 15\n"},
+            "cameras.txt lists camera 1 more than once",
+        ),
         ({"cameras": "1 OTHER 40 30 50 50 20 15\n"}, "cameras.txt uses the camera model OTHER"),
         ({"cameras": "1 EQUIRECTANGULAR 40 30 40 30\n"}, "model EQUIRECTANGULAR.*\n.*cut the pano"),
         ({"cameras": "1 PINHOLE 40 30 50 50 20\n"}, "cameras.txt is malformed in line 2"),
@@ -96,6 +100,15 @@ def test_text_models_and_names_with_blanks_are_read(tmp_path):
 def test_broken_models_are_refused(tmp_path, change, message):
     write_tiny_model(tmp_path, **change)
     with refused(message, *(["image_undistorter"] if "OTHER" in message else [])):
+        load_scene(tmp_path, CFG)
+
+
+def test_binary_models_do_not_list_a_camera_twice(tmp_path):
+    model = write_tiny_model(tmp_path)
+    pycolmap.Reconstruction(model).write_binary(model)
+    file = model / "cameras.bin"
+    file.write_bytes(struct.pack("<Q", 2) + 2 * file.read_bytes()[8:])
+    with refused("cameras.bin lists camera 1 more than once"):
         load_scene(tmp_path, CFG)
 
 
